@@ -128,14 +128,13 @@ class NormalForm:
     ) -> FloatArray:
         """Returns x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
 
-        The inverse is local: other states may have the same coordinates (elbow up, elbow down; an
-        angle and the same angle plus 2 pi, as states are not wrapped). The one that continues the
-        guess is found by damped Newton's method or, if that fails, by continuation along the
-        straight line from the coordinates of the guess to the given ones.
+        The inverse is local: other states may have the same coordinates (elbow up, elbow down). The
+        one that continues the guess is found by damped Newton's method or, if that fails, by
+        continuation along the straight line from the coordinates of the guess to the given ones.
 
         Raises:
-            InconsistentStateError: There is no such state, or it is not reached from the guess. Its
-                residual is the remaining error of the coordinates, shape (n,).
+            InconsistentStateError: There is no such state, or it is not reached from the guess;
+                `residual` is the remaining error of the coordinates.
         """
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
         x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
@@ -163,9 +162,8 @@ class NormalForm:
                 raise InconsistentStateError(
                     f"{self.system.name}: no way from the guess to the given coordinates: "
                     f"{self.coordinate_signals[worst].name} does not reach {target[worst]:.6g}; "
-                    f"the search ended at x = {show(x)}. Start from a guess that is nearer. If the "
-                    "coordinates become dependent there, A(x) of Assumption (2) or B(x) of (16) "
-                    "loses its rank (Theorem 2.1), or xi does not complete the chains any more",
+                    f"the search ended at x = {show(x)}. Start from a guess that is nearer, or "
+                    "A(x), B(x) or the Jacobian of xi loses its rank there (Theorem 2.1)",
                     missing,
                 )
         return x

@@ -259,11 +259,7 @@ class Deciding:
 
 
 class Family:
-    """Random members of a system: consistent states, each with parameters of its own.
-
-    A parameter is drawn within its bounds, or within a factor of two of its default (if that is 0,
-    from -1 to 1). So are the derivatives of an exogenous signal, unless its bounds are equal.
-    """
+    """Random members of a system: consistent states, each with parameters in `parameter_box`."""
 
     def __init__(self, manifold: Manifold, states: FloatArray) -> None:
         self._manifold, self._states = manifold, states
@@ -296,10 +292,7 @@ class Family:
         return Deciding(tuple(pairs))
 
     def lost(self, margin: OfMember, least: float) -> Deciding | None:
-        """Returns parameters within their bounds where a margin is not above the least, or None.
-
-        It is tried at corners and random places of the box of bounds, and minimized from the best.
-        """
+        """Returns parameters within their bounds where a margin is not above the least, or None."""
         system, defaults = self._system, self._system.parameter_values
         bounded = [p for p in system.parameters if p.bounds is not None]
         names = [signal.name for p in bounded for signal in p.signals]

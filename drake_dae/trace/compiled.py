@@ -6,8 +6,7 @@ except for the last bits where the compiler's own sin or pow differ.
 
 Compilation takes a second per 4,000 operations. So the caller chooses: True, machine code from the
 first call; False, none; "auto", code from the cache, and otherwise machine code once a function was
-called so often that compiling it would have paid. This rule takes at most twice the time of the
-better choice. Calls are counted instead of reading a clock, so that each run does the same.
+called so often that compiling it would have paid, at most twice the time of the better choice.
 """
 
 import hashlib
@@ -57,10 +56,7 @@ def check_choice(owner: str, compiled: Any) -> None:
 
 
 def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Function | None:
-    """Returns a function as machine code; None if there is none.
-
-    It writes all results unconditionally: call it by its `buffer()`, with an array bound to each.
-    """
+    """Returns a function as machine code, to be called by its `buffer()`; None if there is none."""
     # With many results, a branch for each takes the compiler ten times as long.
     source = without_branches(generate(function))
     path = library(source, function.n_instructions(), compiled, make)
@@ -155,10 +151,7 @@ def without_branches(source: str) -> str:
 
 
 def generate(*functions: ca.Function) -> str:
-    """Generates the C source of functions, each under its own name.
-
-    A caller in C passes pointers to arguments and results, and no memory.
-    """
+    """Generates the C source of functions, each under its own name, which need no memory."""
     generator = ca.CodeGenerator("code")
     for function in functions:
         generator.add(function)

@@ -73,10 +73,7 @@ class Compiler(NamedTuple):
 
 
 def find_compiler() -> Compiler:
-    """Returns the C compiler named by CC, or else `cc`, or else that of the package ziglang.
-
-    The last is `python -m ziglang cc`, the optional group "compiler".
-    """
+    """Returns the C compiler named by CC, or else `cc`, or else that of the package ziglang."""
     compiler = _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
     if isinstance(compiler, str):
         raise MachineCodeError(compiler)

@@ -128,10 +128,7 @@ def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:
 
 
 def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]]:
-    """Returns rows and columns of the diagonal blocks of a square matrix, in stages.
-
-    A block needs what blocks of earlier stages solve for, and nothing else.
-    """
+    """Returns rows and columns of diagonal blocks, in stages: each needs those of earlier ones."""
     count, rows, columns, row_starts, column_starts, _, _ = pattern.btf()
     used = nonzeros(pattern)
     stages: list[list[tuple[list[int], list[int]]]] = []

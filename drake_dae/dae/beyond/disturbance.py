@@ -148,8 +148,6 @@ class Observation:
                               None if outputs and constraints do not determine the velocities;
         moving(x):            R with the present rates r' of the outputs, and zeros otherwise.
 
-    `rows` are the states whose rates contain d, `frictions` the coefficients of friction with the
-    constraint input of each, `identified` the other parameters that are estimated.
     """
 
     momentum: TracedFunction
@@ -159,9 +157,9 @@ class Observation:
     widths: tuple[int, ...]
     wanted: TracedFunction | None
     moving: TracedFunction
-    rows: tuple[int, ...]
-    frictions: dict[str, int]
-    identified: IdentifiedTerms
+    rows: tuple[int, ...]  # The states whose rates contain d.
+    frictions: dict[str, int]  # Coefficients of friction, with the constraint input of each.
+    identified: IdentifiedTerms  # The other parameters that are estimated.
 
     @classmethod
     def of(cls, structure: Structure, layout: DerivativeLayout) -> "Observation":

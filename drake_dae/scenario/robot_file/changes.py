@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
@@ -35,13 +34,12 @@ from drake_dae.robots import (
     frame_named,
     joint_names,
     triple,
-    unique_names,
 )
 from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.mjcf import ARMATURE
 from drake_dae.scenario.robot_file.robot import Payload, Robot, RobotPlacement
 
-_Leader = tuple[Joint, float, float]
+_Leader = tuple[JointIndex, float, float]
 """The joint that another one follows, the ratio, and the offset, rad or m."""
 
 
@@ -78,7 +76,8 @@ def change_robot(
     locked = _lock_joints(robot.locked, plant, leaders)
     for follower, (leader, ratio, offset) in leaders.items():
         if follower not in locked:
-            plant.AddCouplerConstraint(plant.get_joint(follower), leader, ratio, offset)
+            pair = plant.get_joint(follower), plant.get_joint(leader)
+            plant.AddCouplerConstraint(*pair, ratio, offset)
     _add_free_joints(robot.free, plant)
     efforts, armatures = (noted(plant, known[what]) for what in ("effort", "armature"))
     if robot.actuators is not None:
@@ -126,19 +125,16 @@ def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
 
 def _unattached(name: str, plant: MultibodyPlant) -> Frame:
     """A frame of a body without a joint to a parent."""
-    holding = {joint.child_body().index(): joint for joint in reversed(joints_of(plant))}
-    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-    free = unique_names(plant, [body for body in bodies if body.index() not in holding])
-    try:
-        frame = GetScopedFrameByName(plant, name)
-    except RuntimeError:
-        raise ModelError(unknown_name("free body or frame on it", name, free)) from None
+    frame = frame_named(plant, name)
     if frame.body() == plant.world_body():
         raise ModelError("the world is no part of the robot; name a frame of the robot")
-    if joint := holding.get(frame.body().index()):
+    holding = {joint.child_body().index(): joint.name() for joint in reversed(joints_of(plant))}
+    if frame.body().index() in holding:
+        bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+        free = [body.name() for body in bodies if body.index() not in holding]
         raise ModelError(
-            f"'{name}' is attached already, by joint '{joint.name()}'; unattached bodies: "
-            f"{', '.join(free) or 'none'}"
+            f"'{name}' is attached already, by joint '{holding[frame.body().index()]}'; unattached "
+            f"bodies: {', '.join(free) or 'none'}"
         )
     return frame
 
@@ -157,21 +153,26 @@ def _lock_joints(
     positions |= {_named(name, movable).index(): value for name, value in locked.items()}
     for _ in leaders:  # As often as the longest chain needs.
         for follower, (leader, ratio, offset) in leaders.items():
-            if leader.index() in positions and ratio != 0.0:
-                coupled = ratio * positions[leader.index()] + offset
+            if leader in positions and ratio != 0.0:
+                coupled = ratio * positions[leader] + offset
                 if abs(positions.setdefault(follower, coupled) - coupled) > 1e-9:
                     raise ModelError(
-                        f"'{joints[follower][0]}' follows '{leader.name()}', which makes it "
-                        f"{coupled:g}, and not {positions[follower]:g}; lock one of them"
+                        f"'{plant.get_joint(follower).name()}' follows "
+                        f"'{plant.get_joint(leader).name()}', which makes it {coupled:g}, and not "
+                        f"{positions[follower]:g}; lock one of them"
                     )
             elif follower in positions and ratio != 0.0:
-                positions[leader.index()] = (positions[follower] - offset) / ratio
+                positions[leader] = (positions[follower] - offset) / ratio
     if positions and plant.num_constraints() > 0:
         raise ModelError(
             "the file has constraints other than mimic joints, with which Drake locks no joint; "
             "name them under robot.leave_out, and write them under constraints"
         )
+    welds = list[tuple[JointIndex, WeldJoint]]()
     for index, value in positions.items():
+        if index not in joints:
+            own = plant.get_joint(index).name()
+            raise ModelError(unknown_name("turning or sliding joint", own, movable))
         name, joint = joints[index]
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
         slides = isinstance(joint, PrismaticJoint)
@@ -181,19 +182,27 @@ def _lock_joints(
             raise ModelError(
                 f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
             )
-        own_name, inboard, outboard = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
         if slides:
             pose = RigidTransform(value * joint.translation_axis())
         else:
             pose = RigidTransform(AngleAxis(value, joint.revolute_axis()), np.zeros(3))
+        frames = joint.frame_on_parent(), joint.frame_on_child()
+        welds.append((index, WeldJoint(joint.name(), *frames, pose)))
+        del joint
+    # Python's joint must be gone before Drake's is: a new one at its address would be taken for it.
+    joints.clear()
+    movable.clear()
+    for index, _ in welds:
         for actuator in actuators_of(plant):
-            if actuator.joint() is joint:
+            if actuator.joint().index() == index:
                 plant.RemoveJointActuator(actuator)
         try:
-            plant.RemoveJoint(joint)
+            plant.RemoveJoint(plant.get_joint(index))
         except RuntimeError as error:
-            raise ModelError(f"'{name}' cannot be locked: {error}") from None
-        plant.AddJoint(WeldJoint(own_name, inboard, outboard, pose))
+            own = plant.get_joint(index).name()
+            raise ModelError(f"'{own}' cannot be locked: {error}") from None
+    for _, weld in welds:
+        plant.AddJoint(weld)
     return positions
 
 
@@ -255,7 +264,8 @@ def _leaders(
         if name == joint.name() or not plant.HasJointNamed(name, joint.model_instance()):
             text = f"joint '{joint.name()}' mimics '{name}', which is no other joint of its file"
             raise ModelError(text)
-        leaders[index] = plant.GetJointByName(name, joint.model_instance()), ratio, offset
+        leader = plant.GetJointByName(name, joint.model_instance())
+        leaders[index] = leader.index(), ratio, offset
     return leaders
 
 
