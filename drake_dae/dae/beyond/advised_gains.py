@@ -362,18 +362,12 @@ def _reason(situation: SensedContact, bounds: _Bounds) -> str:
                 f"stable, mostly by {cause}, and {most:.3g} {unit} are allowed: allow more, sample "
                 "more often, or use better sensors"
             )
-    pairs = [
-        [
-            [part for part in parts if part.error <= most]
-            for parts, most in zip(both, most_of, strict=True)
-        ]
-        for both in found
-    ]
-    smoothest = [
-        [min(parts, key=lambda part: part.roughness) for parts in both]
-        for both in pairs
-        if all(both)
-    ]
+    smoothest = []
+    for both in found:  # Of one estimator.
+        bounded = zip(both, most_of, strict=True)
+        within = [[part for part in parts if part.error <= most] for parts, most in bounded]
+        if all(within):
+            smoothest.append([min(parts, key=lambda part: part.roughness) for parts in within])
     if not smoothest:
         return (
             "no rate of the estimator has both errors within their bounds: allow more of one of "

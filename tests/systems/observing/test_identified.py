@@ -219,49 +219,21 @@ ENCODERS = (
     "sensors.encoders={resolution: 1.0e-5}",
     "sensors.force={sample_period: 0.001, noise_deviation: 0.05}",
 )
-TILTED = (
-    *TILT,
-    "estimator.parameters=[wall.rpy]",
-    "plant.parameters.wall.rpy=[0, 0, 0.0872664626]",
-)
-RUBBING = (
-    *FRICTION,
-    f"estimator.parameters=[{', '.join(f'{joint}.coulomb' for joint in JOINTS)}]",
-    *(f"plant.parameters.{joint}.coulomb={value}" for joint, value in COULOMB.items()),
-)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("settings", "position", "force"),
-    [
-        (KILOGRAM, 0.03, 0.05),
-        ((*KILOGRAM, *ENCODERS), 0.03, 0.05),
-        pytest.param(TILTED, 0.03, 0.05, marks=pytest.mark.thorough),
-        pytest.param(RUBBING, 0.05, 0.1, marks=pytest.mark.thorough),
-    ],
-    ids=[
-        "1 kg more",
-        "1 kg more, encoders alone",
-        "5 degrees",
-        "Coulomb friction in joints",
-    ],
-)
-def test_errors_of_the_model_are_found_and_compensated(settings, position, force):
+@pytest.mark.parametrize("sensors", [(), ENCODERS], ids=["velocities", "encoders alone"])
+def test_a_kilogram_more_is_found_and_compensated(sensors):
     """The figures of the book, mm and N after 3 s; a fifth of them without the estimate."""
-    _, _, record = rolled(5.0, *settings)
-    found = rms(record, 3.0)
-    assert found[0] < position
-    assert found[1] < force
-    friction = record["friction"][-1, 0]
-    assert abs(friction - 0.3) < 0.03
-    tilt = 0.0872664626 * (settings is TILTED)
-    true = {"payload.mass": 1.0, "wall.rpy[1]": 0.0, "wall.rpy[2]": tilt}
+    _, _, record = rolled(5.0, *KILOGRAM, *sensors)
+    position, force = rms(record, 3.0)
+    assert position < 0.03
+    assert force < 0.05
+    assert abs(record["friction"][-1, 0] - 0.3) < 0.03
     names = [signal.name for signal in record.signals["identified"].signals]
-    pairs = zip(record["identified"][-1], record["identified_deviation"][-1], strict=True)
-    for name, (value, deviation) in zip(names, pairs, strict=True):
-        if name in true:
-            assert abs(value - true[name]) < 2.0 * deviation
+    place = names.index("payload.mass")
+    deviation = record["identified_deviation"][-1, place]
+    assert abs(record["identified"][-1, place] - 1.0) < 2.0 * deviation
 
 
 @pytest.mark.slow
@@ -330,13 +302,12 @@ def test_bounds_are_needed_in_python_too():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("acceleration", [0.3, pytest.param(0.05, marks=pytest.mark.thorough)])
-def test_a_contact_breaks_away_for_the_first_time_without_a_swing(acceleration):
+def test_a_contact_breaks_away_for_the_first_time_without_a_swing():
     """At most 0.1 mm and 0.1 N at a friction of 0.45 that the law takes for 0; 2.6 mm without.
 
     A rest of 1 s, then a line.
     """
-    limits = f"{{speed: 0.05, acceleration: {acceleration}}}"
+    limits = "{speed: 0.05, acceleration: 0.3}"
     line = f"!Line {{start: [0.0], end: [0.05], limits: {limits}, start_time: 1.0}}"
     settings = [
         f"references.tool.y={line}",
