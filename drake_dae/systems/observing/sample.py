@@ -17,8 +17,9 @@ from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.observing.parameters import ParameterFilter, Regressor
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
-_PARAMETER_PERIOD = 0.01
-"""The time in s, in whole samples, between samples of the filter of parameters."""
+_PARAMETER_PERIOD, _NOISY_PERIOD = 0.01, 0.002
+"""The time in s, in whole samples, between samples of the filter of parameters; and where the state
+is estimated: slower samples would take its noise for slopes."""
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""
@@ -106,7 +107,8 @@ class EstimatorSample:
             "theta": values[self._places].tolist(),
         }
         self._memory = {name: ca.SX.sym(name, len(value)) for name, value in start.items()}
-        slower = max(round(_PARAMETER_PERIOD / period), 1) * period
+        wanted = _NOISY_PERIOD if estimates else _PARAMETER_PERIOD
+        slower = max(round(wanted / period), 1) * period
         within, most = estimated_within(theta, observing.ranges), observing.largest_friction
         self._filter = ParameterFilter(identified, within, c, most, rates[0], slower)
         self._ratio = round(slower / period)
