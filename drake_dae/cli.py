@@ -16,12 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import drake_dae
-from drake_dae.errors import (
-    DrakeDaeError,
-    NonMinimumPhaseWarning,
-    ScenarioError,
-    describe_os_error,
-)
+from drake_dae.errors import DrakeDaeError, NonMinimumPhaseWarning, ScenarioError, describe_os_error
 from drake_dae.running.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO
 

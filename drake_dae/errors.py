@@ -63,11 +63,7 @@ class AssumptionError(DrakeDaeError):
     """
 
     def __init__(
-        self,
-        message: str,
-        assumption: int,
-        state: ArrayLike | None = None,
-        violation: Any = None,
+        self, message: str, assumption: int, state: ArrayLike | None = None, violation: Any = None
     ) -> None:
         super().__init__(message)
         self.assumption = assumption

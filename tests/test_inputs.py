@@ -38,10 +38,7 @@ LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
 
 YAML = {
     "a billion laughs": (LAUGHS, "line .*100000"),
-    "laughs in merged keys": (
-        "a: &a {x: 1}\n" + LAUGHS.replace("lol", "*a"),
-        "100000",
-    ),
+    "laughs in merged keys": ("a: &a {x: 1}\n" + LAUGHS.replace("lol", "*a"), "100000"),
     "an alias inside of itself": ("a: &a [*a]", "100000"),
     "5,000 brackets": ("[" * 5000 + "]" * 5000, "file: "),
     "two megabytes": ("a: " + "x" * 2_000_000, "1000000"),
@@ -128,10 +125,7 @@ SECOND = """<transmission name="t2"><type>transmission_interface/SimpleTransmiss
 <joint name="j"/><actuator name="m2"/></transmission>"""
 
 ROBOTS = {
-    "a mass below zero": (
-        {"mass": '<mass value="-6"/>'},
-        "'arm'.*-6 kg",
-    ),
+    "a mass below zero": ({"mass": '<mass value="-6"/>'}, "'arm'.*-6 kg"),
     "no mass": ({"mass": '<mass value="0"/>'}, "'arm'"),
     "a mass left out": ({"mass": ""}, "'arm'"),
     "an impossible inertia": (
@@ -146,10 +140,7 @@ ROBOTS = {
         "3 values .*damping",
     ),
     "a motor of a planar joint": ({"type": "planar", "dynamics": ""}, "'j'"),
-    "Coulomb friction": (
-        {"dynamics": '<dynamics damping="0.1" friction="0.5"/>'},
-        "joint 'j'",
-    ),
+    "Coulomb friction": ({"dynamics": '<dynamics damping="0.1" friction="0.5"/>'}, "joint 'j'"),
     "no effort": ({"effort": "0"}, "'j'.*effort"),
     "two actuators on a joint": ({"more": SECOND}, "m, m2"),
     "a second robot": ({"after": '<robot name="b"/>'}, r"robot\.urdf:10"),

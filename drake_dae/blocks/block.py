@@ -209,11 +209,7 @@ class BlockFunction(TracedFunction):
     """Some values of a block as a function of the columns, `sources`, that they depend on."""
 
     def __init__(
-        self,
-        block: Block,
-        what: str,
-        values: Mapping[str, ca.SX],
-        compiled: Compiled = False,
+        self, block: Block, what: str, values: Mapping[str, ca.SX], compiled: Compiled = False
     ) -> None:
         columns, self.sources = block.columns(), tuple(block.sources(*values.values()))
         inputs = {name.removeprefix("input "): columns[name] for name in self.sources}

@@ -343,9 +343,7 @@ class _Walk:
         start = local.get_continuous_state_vector().CopyToVector() if size else np.zeros(0)
         held = {
             name: replace(
-                each,
-                symbol=own[f"held {name}"],
-                start=local.get_discrete_state(i).CopyToVector(),
+                each, symbol=own[f"held {name}"], start=local.get_discrete_state(i).CopyToVector()
             )
             for i, (name, each) in enumerate(moved.held.items())
         }

@@ -158,13 +158,7 @@ def _tableau(a: list[list[float]], b: list[float], c: list[float]) -> Tableau:
     return Tableau(square, np.array(b, dtype=float), np.array(c, dtype=float))
 
 
-FIXED = (
-    "explicit_euler",
-    "runge_kutta2",
-    "runge_kutta3",
-    "bogacki_shampine3",
-    "runge_kutta5",
-)
+FIXED = ("explicit_euler", "runge_kutta2", "runge_kutta3", "bogacki_shampine3", "runge_kutta5")
 """Drake's explicit schemes."""
 
 

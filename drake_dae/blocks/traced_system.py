@@ -190,7 +190,7 @@ def context_in(system: System, root: Context) -> Context:
         return system.GetMyMutableContextFromRoot(root)
     except RuntimeError:
         raise ModelError(
-            f"the context is that of another diagram, which has not this '{system.get_name()}'"
+            f"the context is that of another diagram, without this '{system.get_name()}'"
         ) from None
 
 

@@ -44,7 +44,7 @@ def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Recor
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Record:
-    """All signals of a run at the ends of the integrator's steps.
+    """All signals of a run, at the ends of steps, at samples, or at the times of a rollout.
 
     NumPy reads its file: `numpy.load("record.npz")` has "time" in s, for each signal its values,
     shape (k, size), "<signal>.names" and "<signal>.units", and "about" as JSON: the versions of the

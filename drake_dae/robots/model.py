@@ -21,12 +21,7 @@ from drake_dae.robots.constraints.couplers import plant_constraints
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import Load
-from drake_dae.robots.outputs import (
-    ForceOutput,
-    PositionOutput,
-    as_force_outputs,
-    force_rows,
-)
+from drake_dae.robots.outputs import ForceOutput, PositionOutput, as_force_outputs, force_rows
 from drake_dae.robots.statics import StaticBalance, StaticPlacement
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.functions import TracedFunction
@@ -244,10 +239,7 @@ class RobotModel:
 
     @checked(ModelError)
     def configuration(
-        self,
-        outputs: ArrayLike | None,
-        guess: ArrayLike,
-        parameters: ArrayLike | None = None,
+        self, outputs: ArrayLike | None, guess: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
         """q = psi(z_1) of (58), shape (nq,): the consistent configuration with given outputs.
 

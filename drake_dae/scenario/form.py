@@ -217,10 +217,7 @@ class Reader:
     """
 
     def __init__(
-        self,
-        form: type,
-        families: Mapping[Any, Family],
-        keys: Mapping[type, Mapping[str, Key]],
+        self, form: type, families: Mapping[Any, Family], keys: Mapping[type, Mapping[str, Key]]
     ) -> None:
         self._families, self._keys = families, keys
         self._types, self._free = dict[Any, Any](), set[str]()  # Keys whose names are free.
@@ -236,10 +233,7 @@ class Reader:
         return dict(json.loads(text))
 
     def read(
-        self,
-        data: Any,
-        folder: Path | None = None,
-        place_of: Callable[[str], str] = lambda key: "",
+        self, data: Any, folder: Path | None = None, place_of: Callable[[str], str] = lambda key: ""
     ) -> Any:
         """Makes the dataclass; files are in `folder`, and `place_of` tells where a key stands."""
         try:

@@ -220,8 +220,8 @@ def _check_bounds(scenario: Scenario) -> None:
     for name in ("largest_roughness", "largest_errors"):
         if getattr(law, name) is not None and not is_used:
             text = (
-                "it is used only for gains that are computed for rigid joints with encoders in "
-                "Drake's contact; leave it out, or leave `law.gains` out and give encoders"
+                "it is used only if `law.gains` is left out, `sensors.encoders` is given, and the "
+                "plant is !CompliantContact or !MultibodyPlant; leave it out, or change these"
             )
             raise ScenarioError((f"law.{name}", text))
 

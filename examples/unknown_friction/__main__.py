@@ -36,12 +36,7 @@ SETTLED, DURATION = 2.0, 6.0
 ROUGHNESS = 0.4  # N m from one sample to the next.
 LATE = "sampling={period: 0.001, delay: 0.001}"
 POINT = "plant=!MultibodyPlant {time_step: 0.001, stiffness: 1.0e5, friction: 0.3}"
-UNKNOWN = (
-    "law.gains=",
-    "constraints.0.friction=0.0",
-    POINT,
-    LATE,
-)
+UNKNOWN = ("law.gains=", "constraints.0.friction=0.0", POINT, LATE)
 TILTED = (
     "constraints.0.surface.normal=[-0.965925826, -0.258819045, 0.0]",
     "references={tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [1.0]},"

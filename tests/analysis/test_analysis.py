@@ -5,10 +5,7 @@ import re
 import casadi as ca
 import numpy as np
 import pytest
-from problems import (
-    PROBLEMS,
-    system_of,
-)
+from problems import PROBLEMS, system_of
 from problems.found import NO, YES, findings
 from runs import some
 

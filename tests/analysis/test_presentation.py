@@ -3,10 +3,7 @@
 import json
 
 import pytest
-from problems import (
-    PROBLEMS,
-    redundant,
-)
+from problems import PROBLEMS, redundant
 from problems.found import findings
 from runs import some
 

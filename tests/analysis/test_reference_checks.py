@@ -4,9 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from problems import (
-    PROBLEMS,
-)
+from problems import PROBLEMS
 
 from drake_dae.analysis import analyze
 

@@ -3,9 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import (
-    PROBLEMS,
-)
+from problems import PROBLEMS
 
 from drake_dae.analysis import analyze
 from drake_dae.dae import DaeSystem, Manifold
@@ -27,14 +25,7 @@ def test_given_states():
 def circle() -> Manifold:
     x = ca.SX.sym("x", 2)
     system = DaeSystem(
-        state=x,
-        f=[0, 0],
-        g=[1, 0],
-        h=[0, 1],
-        k=ca.sumsqr(x) - 1,
-        l=x[1],
-        m=[0],
-        name="circle",
+        state=x, f=[0, 0], g=[1, 0], h=[0, 1], k=ca.sumsqr(x) - 1, l=x[1], m=[0], name="circle"
     )
     return Manifold(system, [[system.k]])
 

@@ -129,10 +129,7 @@ def test_closed_loop(compare):
             figure = f"derivative of the closed loop, 7 joints, {name}: {how}"
             wanted = 1.0 if (name, how) == ("as one block", "machine code") else ""
             compare(figure, alone[name], "empty blocks", alone["empty"], wanted)
-        runs = [
-            stepping(block, block.CreateDefaultContext()),
-            stepping(*pairs["empty"]),
-        ]
+        runs = [stepping(block, block.CreateDefaultContext()), stepping(*pairs["empty"])]
         found = np.array([[run() for run in runs] for _ in range(30)]).min(axis=0) * 1e-6
         figure = f"1 ms step of the block, RK3, projected: {how}"
         compare(figure, found[0], "empty blocks", found[1])

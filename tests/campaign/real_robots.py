@@ -105,11 +105,7 @@ ROBOTS = {
 }
 """Package -> the files of robots, none of which any test names."""
 
-_INSIDE = {
-    "example-robot-data": "robots",
-    "robosuite": "models/assets/robots",
-    "pybullet_data": "",
-}
+_INSIDE = {"example-robot-data": "robots", "robosuite": "models/assets/robots", "pybullet_data": ""}
 
 
 def installed() -> Iterator[tuple[str, Path]]:

@@ -217,8 +217,7 @@ def test_a_shipped_scenario_is_shown_as_it_is_or_where_it_is(capsys):
 
 
 @pytest.mark.parametrize(
-    ("name", "words"),
-    [("two_link_wal", "'two_link_wall'"), ("binary.yaml", "binary.yaml")],
+    ("name", "words"), [("two_link_wal", "'two_link_wall'"), ("binary.yaml", "binary.yaml")]
 )
 def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

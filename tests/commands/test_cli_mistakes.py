@@ -65,10 +65,7 @@ def test_a_folder_is_no_device(command, capsys):
         (["two_link_wal"], "error: .*'two_link_wal'.*'two_link_wall'"),
         (["two_link_wall", "--set", "duration=-1"], "error: duration: .*-1"),
         (["two_link_wall", "--set", "duration"], "error: --set duration: "),
-        (
-            ["two_link_wall", "--set", "outputs.0.frame=tol"],
-            "error: outputs.0: .*'tol'",
-        ),
+        (["two_link_wall", "--set", "outputs.0.frame=tol"], "error: outputs.0: .*'tol'"),
         (["two_link_wall", "--set", "robot.file=x.urdf"], "error: robot.file: .*x.urdf"),
     ],
 )

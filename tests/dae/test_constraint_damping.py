@@ -13,13 +13,7 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 from problems import PROBLEMS
 
-from drake_dae import (
-    ConstantReference,
-    DaeSystem,
-    PointToPointReference,
-    TrackingLaw,
-    poles,
-)
+from drake_dae import ConstantReference, DaeSystem, PointToPointReference, TrackingLaw, poles
 from drake_dae.dae import contact_damping
 from drake_dae.errors import AdviceWarning, ModelError
 from drake_dae.references import stack_references

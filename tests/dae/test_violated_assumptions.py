@@ -111,11 +111,7 @@ def test_5_outputs_that_repeat():
     q = system.state
     one_more = [system.l[i] for i in range(4)]
     no_force = np.array([[1, 0], [0, 0], [0, 1], [0, 0]])
-    for row, output in (
-        (3, 2 * q[2] + 1),
-        (3, ca.sin(q[2])),
-        (3, q[2] * (1 + (q[0] - 1) * q[3])),
-    ):
+    for row, output in ((3, 2 * q[2] + 1), (3, ca.sin(q[2])), (3, q[2] * (1 + (q[0] - 1) * q[3]))):
         error = violation(changed(system, l=ca.vertcat(*one_more[:row], output), m=no_force))
         assert error.assumption == 5
         assert error.violation.names == ("v1", "q3", "v2", "q4")

@@ -164,6 +164,17 @@ def test_forces_of_two_arms_on_a_free_box_are_those_of_drake():
         assert left[0] > 10.0 > -10.0 > right[0]  # Both press.
 
 
+@pytest.mark.slow
+def test_two_arms_carry_a_free_box_with_the_error_by_hand():
+    references = list(scenario("two_arms_free_box", *FINE).references.values())
+    _, _, record = run("two_arms_free_box", *FINE)
+    for index in (0, 1, 2):
+        error = record["tracking_error"][:, index]
+        wanted = at_rest(record, references[index], index, 2, rate=4.0)
+        assert_allclose(error, wanted, atol=1e-9)
+    assert_allclose(record["tracking_error"][:, 8:], 0.0, atol=1e-9)  # Met at once.
+
+
 # What does not fit.
 
 

@@ -112,19 +112,10 @@ def test_surface_may_be_tilted():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (
-            "plant.disturbances=[{frame: tol, force: [0, 0, 1]}]",
-            r"plant.disturbances.0: .*'tol'",
-        ),
+        ("plant.disturbances=[{frame: tol, force: [0, 0, 1]}]", r"plant.disturbances.0: .*'tol'"),
         ("plant.payloads=[{frame: tool, mass: 0}]", r"plant.payloads.0: .*mass"),
-        (
-            "plant.payloads=[{frame: tool, mass: 1}, {frame: tool, mass: 1}]",
-            "plant.payloads.1: ",
-        ),
-        (
-            "plant.disturbances=[{frame: world, force: [0, 0, 1]}]",
-            "plant.disturbances.0: ",
-        ),
+        ("plant.payloads=[{frame: tool, mass: 1}, {frame: tool, mass: 1}]", "plant.payloads.1: "),
+        ("plant.disturbances=[{frame: world, force: [0, 0, 1]}]", "plant.disturbances.0: "),
         ("sampling={period: 0.001}", r"sampling: .*0\.001"),
     ],
 )

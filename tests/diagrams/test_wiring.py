@@ -47,10 +47,7 @@ def test_a_sensor_that_no_law_uses_is_refused():
 
 
 def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
-    with pytest.raises(
-        WiringError,
-        match=r"2.*'two_link'.*1.*wall.force.*ForceSensor\(1, ",
-    ):
+    with pytest.raises(WiringError, match=r"2.*'two_link'.*1.*wall.force.*ForceSensor\(1, "):
         rigid(dd.ForceSensor(2, time_constant=0.01))
 
 
@@ -114,11 +111,7 @@ def test_a_scenario_with_another_mass_in_the_plant():
         ("two_link_flexible", "actuation.0.stiffness=[-1]", "actuation.0: "),
         ("two_link_wall", "actuation=[!FlexibleJoints {stiffness: [8e3]}]", "joint1_motor"),
         ("two_link_motors", "actuation.0.torque_constant=[0]", "torque_constant"),
-        (
-            "two_link_wall",
-            ["sensors.force={}", "law.force_gain=1"],
-            "time_constant",
-        ),
+        ("two_link_wall", ["sensors.force={}", "law.force_gain=1"], "time_constant"),
         (
             "two_link_wall",
             ["sensors.force={sample_period: 0.01}", "law.force_gain=2"],

@@ -38,13 +38,7 @@ CLAIMS = {
 }
 
 
-DEAR = (
-    "actuation_comparison",
-    "flexible_joints",
-    "dc_motors",
-    "flexible_motors",
-    "section_two",
-)
+DEAR = ("actuation_comparison", "flexible_joints", "dc_motors", "flexible_motors", "section_two")
 """Their claims are those of tests of actuation and of section 2."""
 
 

@@ -54,10 +54,7 @@ def forces(s, p):
 
 def gaps(s, p):
     xb, yb = wheel(p.time)
-    return [
-        xb * s[0] + yb * s[1],
-        (s[0] - s[2]) ** 2 + (s[1] - s[3]) ** 2 - LENGTH**2,
-    ]
+    return [xb * s[0] + yb * s[1], (s[0] - s[2]) ** 2 + (s[1] - s[3]) ** 2 - LENGTH**2]
 
 
 @pytest.mark.slow

@@ -8,14 +8,7 @@ import numpy as np
 from arms import error_controlled
 from numpy.testing import assert_allclose
 
-from drake_dae import (
-    DaePlant,
-    DaeSystem,
-    LinkExpressions,
-    RobotModel,
-    RobotPlant,
-    simulate,
-)
+from drake_dae import DaePlant, DaeSystem, LinkExpressions, RobotModel, RobotPlant, simulate
 from drake_dae.robots import Blade
 
 G = 9.81

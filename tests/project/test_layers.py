@@ -36,8 +36,7 @@ def test_the_mathematics_loads_no_drake() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "words",
-    [["list"], ["print"], ["print", "--path"], ["--version"], ["--help"]],
+    "words", [["list"], ["print"], ["print", "--path"], ["--version"], ["--help"]]
 )
 def test_what_needs_no_robot_loads_none(words: list[str]) -> None:
     code = (

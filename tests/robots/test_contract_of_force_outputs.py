@@ -111,10 +111,7 @@ def test_a_squeeze_is_half_the_force_toward_the_other_contact(name):
         (NamedForce("grip2.f"), "'grip2.f'"),
         (ForceCombination({"grip2.f": 1.0}, "a"), "'grip2.f'"),
         (Squeeze("object", "grip1", "grip4"), "'grip4'"),
-        (
-            Squeeze("finger1::tip", "grip1", "grip2"),
-            "'grip2'.*'finger1::tip'",
-        ),
+        (Squeeze("finger1::tip", "grip1", "grip2"), "'grip2'.*'finger1::tip'"),
         (Pull("object", "grip", (1, 0, 0)), "'grip'"),
     ],
 )

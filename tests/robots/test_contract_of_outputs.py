@@ -78,10 +78,7 @@ def test_rows_are_independent_functions_of_the_positions(output):
         (AxisCoordinates("tol", "z", "xy"), "'tol'"),
         (JointPositions(["joint9"]), "'joint9'"),
         (TiltFromNormal(PointOnSurface("tol", WALL.surface), "z"), "'tol'"),
-        (
-            TiltFromNormal(CoincidentPoints("world", (0, 0, 0), "tool", (0, 0, 0)), "z"),
-            "'pin'",
-        ),
+        (TiltFromNormal(CoincidentPoints("world", (0, 0, 0), "tool", (0, 0, 0)), "z"), "'pin'"),
         (SurfaceCoordinates(PointOnSurface("tol", WALL.surface)), "'tol'"),
     ],
 )

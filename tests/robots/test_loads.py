@@ -8,11 +8,7 @@ from numpy.testing import assert_allclose
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 
-from drake_dae import (
-    RobotModel,
-    RobotPlant,
-    load_scenario,
-)
+from drake_dae import RobotModel, RobotPlant, load_scenario
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots import KnownForce, KnownWrench
 from drake_dae.scenario.build import build_scenario

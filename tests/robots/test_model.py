@@ -54,9 +54,7 @@ def test_textbook_arm_is_the_urdf_arm():
     for letter in "fghklm":
         first, second = (
             TracedFunction(
-                letter,
-                {"x": dae.state, "p": dae.parameter_symbol},
-                {letter: getattr(dae, letter)},
+                letter, {"x": dae.state, "p": dae.parameter_symbol}, {letter: getattr(dae, letter)}
             )
             for dae in (ours, theirs)
         )
@@ -162,27 +160,18 @@ def test_two_motors_on_one_joint_share_its_torque_by_their_weights():
     ("make", "message"),
     [
         (lambda: textbook(outputs=[]), "1.*0"),
-        (
-            lambda: textbook(outputs=[JointPositions(["q0", "q1"])]),
-            "q0, q1",
-        ),
+        (lambda: textbook(outputs=[JointPositions(["q0", "q1"])]), "q0, q1"),
         (lambda: textbook(outputs=[PointCoordinates("tol", "z")]), "'tol'"),
         (lambda: textbook(outputs=[JointPositions(["q7"])]), "q7"),
         (lambda: textbook(outputs=[PointCoordinates("tool", "w")]), "'w'"),
         (lambda: textbook(outputs=[AxisCoordinates("tool", "q", "x")]), "'q'"),
-        (
-            lambda: textbook(mass_matrix=ca.DM([[1, 2], [2, 1]])),
-            "M.q.",
-        ),
+        (lambda: textbook(mass_matrix=ca.DM([[1, 2], [2, 1]])), "M.q."),
         (lambda: textbook(mass_matrix=ca.DM.eye(3)), r"mass_matrix.*\(3, 3\)"),
         (lambda: textbook(actuation_matrix=np.eye(3)), r"actuation_matrix.*\(3, 3\)"),
         (lambda: textbook(position_limits=([0.0], [1.0])), r"position_limits.*\(2,\)"),
         (lambda: textbook(velocity_limits=([1, 1], [1, 2])), "velocity_limits"),
         (lambda: textbook(constraints=[WALL, WALL], outputs=[]), "wall"),
-        (
-            lambda: textbook(outputs=[ExpressionOutput(lambda links: links.q, [Signal("a")])]),
-            "2",
-        ),
+        (lambda: textbook(outputs=[ExpressionOutput(lambda links: links.q, [Signal("a")])]), "2"),
     ],
 )
 def test_refusals(make, message):

@@ -318,16 +318,10 @@ def parameters(loop, wall):
     ("settings", "message"),
     [
         (["estimator={rate: -1}"], "rate"),
-        (
-            ["estimator={rate: 5, parameters: [wal.friction]}"],
-            "'wal.friction'",
-        ),
+        (["estimator={rate: 5, parameters: [wal.friction]}"], "'wal.friction'"),
         (["estimator={rate: 5, parameters: [wall.friction]}"], "friction"),
         (["estimator={rate: 5}", "law.gains={all: [-9]}"], "measured force"),
-        (
-            ["estimator={rate: 5}", "sampling=", "plant=!IdealConstraints {}"],
-            "observe",
-        ),
+        (["estimator={rate: 5}", "sampling=", "plant=!IdealConstraints {}"], "observe"),
     ],
 )
 def test_observer_that_does_not_fit_is_refused(settings, message):

@@ -39,10 +39,7 @@ def test_without_commands_it_is_the_scenario(name):
 def test_errors_stay_as_predicted_whatever_is_commanded(name):
     """The wall moves by as many lags for the plant as for the law, which needs more derivatives."""
     built = build_commanded(scenario(name, "start.errors={tool.z: 0.01}"))
-    path = {
-        "reference__tool__z": 0.05,
-        "reference__wall__force": 12.0,
-    }
+    path = {"reference__tool__z": 0.05, "reference__wall__force": 12.0}
     found = jumped(built, 1.5, **path, **{"exogenous.wall.position[0]": -0.06})
     error, wanted = found["tracking_error"], built.loop.predicted_error(found)
     size = np.abs(found["desired_output"]).max(axis=0)

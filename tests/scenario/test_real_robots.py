@@ -38,8 +38,7 @@ DEAR = ("panda", "tiago", "so100", "ur10", "xarm7", "z1", "kinova")
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(one, marks=[pytest.mark.thorough] * (one in DEAR)) for one in ROBOTS],
+    "name", [pytest.param(one, marks=[pytest.mark.thorough] * (one in DEAR)) for one in ROBOTS]
 )
 def test_a_robot_runs_as_predicted_on_a_surface_that_new_finds(name, tmp_path):
     file = tmp_path / "task.yaml"

@@ -143,10 +143,10 @@ REFUSED = {
         ),
     },
     "seven_joint_wall": {
-        "start={positions: {joint1: 0}}": "outputs: Assumption (5)|start.positions",
+        "start={positions: {joint1: 0}}": "outputs: Assumption (5)|start.positions"
     },
     "seven_joint_pipe": {
-        "outputs.0=!PointCoordinates {frame: tool, axes: yz}": "pipe.a|!SurfaceCoordinates",
+        "outputs.0=!PointCoordinates {frame: tool, axes: yz}": "pipe.a|!SurfaceCoordinates"
     },
     "rod": {
         "constraints.0.length=0": "constraints.0: |'rod.length'",

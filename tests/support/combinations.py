@@ -21,10 +21,7 @@ integrator:
   max_step_size: 1.0e-3
   accuracy: 1.0e-9
 """
-FRICTION = {
-    "smooth": "friction: 0.0",
-    "frictional": "friction: 0.3",
-}
+FRICTION = {"smooth": "friction: 0.0", "frictional": "friction: 0.3"}
 ACTUATION = {
     "rigid": "",
     "springs": "actuation: [!FlexibleJoints {stiffness: 1000.0, inertia: 0.5}]\n",

@@ -73,11 +73,7 @@ PAPER = (
     "extension",
 )
 # Distributions whose modules bear another name.
-IMPORT_NAMES = {
-    "drake": "pydrake",
-    "pycollada": "collada",
-    "pyyaml": "yaml",
-}
+IMPORT_NAMES = {"drake": "pydrake", "pycollada": "collada", "pyyaml": "yaml"}
 
 
 @cache

@@ -141,11 +141,7 @@ def terms_of(expressions):
         "v": expressions.v,
         "masses": ca.vertcat(*[parameter.symbol for parameter in expressions.parameters]),
     }
-    outputs = {
-        "M": expressions.mass_matrix,
-        "H": expressions.bias,
-        "N": expressions.velocity_map,
-    }
+    outputs = {"M": expressions.mass_matrix, "H": expressions.bias, "N": expressions.velocity_map}
     return TracedFunction("terms", inputs, outputs)
 
 

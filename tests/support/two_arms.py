@@ -7,13 +7,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae import (
-    AxisCoordinates,
-    JointPositions,
-    PointCoordinates,
-    RobotModel,
-    WeldedFrames,
-)
+from drake_dae import AxisCoordinates, JointPositions, PointCoordinates, RobotModel, WeldedFrames
 from drake_dae.robots import Stage
 from drake_dae.scenario.shipped import FOLDER
 

@@ -49,10 +49,10 @@ class Constraint(ABC):
        move (see `RobotModel`) if k = m; `rate` is then the part of the derivative from velocities.
     2. `residual` is phi(q), shape (k, 1), zero if the constraint holds. The first k of the m rows
        are holonomic; the others restrict velocities alone (nonholonomic, r = 1).
-    3. `rate` is linear in velocities, shape (m, 1), and zero; its first k rows are the derivative
-       of `residual`. A constraint with k < m defines `rate` itself. If the constraint holds,
-       lambda . rate is the power of the constraint forces without friction: lambda is a force in N
-       if the rate is a velocity in m/s. Where `is_unilateral`, lambda >= 0 pushes to the free side.
+    3. `rate`, shape (m, 1), is linear in velocities, and zero where the constraint holds; its first
+       k rows are the derivative of `residual`. A constraint with k < m defines it itself. Where it
+       holds, lambda . rate is the power of the forces without friction: lambda is a force in N if
+       the rate is a velocity in m/s. Where `is_unilateral`, lambda >= 0 pushes to the free side.
     4. `reaction` is linear in lambda: the gradient of that power by the velocities, and forces
        proportional to lambda, as of friction. `drag` are forces independent of lambda.
     5. `applications` are all these forces, each on one frame and the opposite on another; none if

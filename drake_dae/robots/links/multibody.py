@@ -86,7 +86,8 @@ class MultibodyExpressions(Links):
 
     Attributes:
         parameters: The mass in kg of every body that has one, "<body>.mass". As in
-            RigidBody.SetMass, center of mass and unit inertia do not change with it.
+            RigidBody.SetMass, center of mass and unit inertia do not change with it. The place of a
+            point mass in m, shape (3,), is "<body>.center".
         position_signals, velocity_signals: Names and units of q ("joint1", "base_qx") and of v
             ("joint1_w", "base_wx"), unique in both together; a joint name that several model
             instances use is written "instance::joint1".

@@ -59,11 +59,7 @@ class TrackingController(ParameterizedSystem, Controller):
     follows, is_law, shown = True, True, ("tracking_error",)
 
     def __init__(
-        self,
-        law: TrackingLaw,
-        outputs: ArrayLike | None = None,
-        *,
-        sample_period: float = 0.0,
+        self, law: TrackingLaw, outputs: ArrayLike | None = None, *, sample_period: float = 0.0
     ) -> None:
         count = len(law.integral.outputs)
         if count and not sample_period >= 0.0:

@@ -93,9 +93,7 @@ class ReferenceGenerator(TracedSystem):
 
 
 def reference_block(
-    references: Sequence[Reference],
-    degrees: Sequence[int],
-    parameters: Mapping[str, FloatArray],
+    references: Sequence[Reference], degrees: Sequence[int], parameters: Mapping[str, FloatArray]
 ) -> Block:
     """R(t) with its derivatives, as a block; see `ReferenceGenerator`."""
     if (covered := sum(reference.size for reference in references)) != len(degrees):

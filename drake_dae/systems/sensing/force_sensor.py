@@ -98,11 +98,7 @@ class ForceSensor(TracedSystem):
         super().__init__(block)
 
     def set_errors(
-        self,
-        context: Context,
-        bias: ArrayLike,
-        noise_deviation: ArrayLike,
-        drift: ArrayLike = 0.0,
+        self, context: Context, bias: ArrayLike, noise_deviation: ArrayLike, drift: ArrayLike = 0.0
     ) -> None:
         """Sets bias, noise_deviation and drift in a context, numbers or shape (m,).
 

@@ -113,10 +113,7 @@ def table(
 ) -> list[str]:
     """One table of digits, and why there is a '-', as lines of Markdown."""
     heads = [engine.NAME for engine in engines]
-    lines = [
-        "| " + " | ".join([title, *heads]) + " |",
-        "|" + "---|" * (len(heads) + 1),
-    ]
+    lines = ["| " + " | ".join([title, *heads]) + " |", "|" + "---|" * (len(heads) + 1)]
     for name, row in cells.items():
         lines.append("| " + " | ".join([name, *(str(row[head]) for head in heads)]) + " |")
     lines += ["", "Why there is a '-':\n"]

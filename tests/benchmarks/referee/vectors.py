@@ -34,11 +34,7 @@ def dot(a: Sequence, b: Sequence) -> object:
 
 def cross(a: Sequence, b: Sequence) -> list:
     """a x b."""
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def apply(matrix: Sequence, vector: Sequence) -> list:

@@ -3,15 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from actuated import (
-    EACH,
-    actuated,
-    at_rest,
-    drive,
-    rates,
-    start_position,
-    states,
-)
+from actuated import EACH, actuated, at_rest, drive, rates, start_position, states
 from arms import arm, touching
 
 from drake_dae import LinkExpressions, RobotModel, RobotPlant
@@ -136,10 +128,7 @@ SHAFT = {"stiffness": 8e3, "inertia": 1.0}
             [ElectrohydraulicServos(**SERVO | {"geometry": lambda q: q})],
             r"geometry.*\(2, 1\).*\(2, 2\)",
         ),
-        (
-            [DcMotors(**MOTOR), FlexibleJoints(**SHAFT)],
-            "FlexibleJoints",
-        ),
+        ([DcMotors(**MOTOR), FlexibleJoints(**SHAFT)], "FlexibleJoints"),
     ],
 )
 def test_refusals(actuation, message):

@@ -134,8 +134,7 @@ def explicit_actuator(name, kind, x, reference, gains, force_gains):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "full"),
-    [("flexible", True), ("motor", False), ("motor", True), ("hydraulic", True)],
+    ("kind", "full"), [("flexible", True), ("motor", False), ("motor", True), ("hydraulic", True)]
 )
 @pytest.mark.parametrize("name", MOSTLY_TWO_LINK)
 @pytest.mark.equation(39, 64, 65, 66, 67, 68, 69, 70, 74, 75, 76, 77, 78, 79, 80)

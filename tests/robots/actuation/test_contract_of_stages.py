@@ -61,9 +61,7 @@ def test_equations_are_of_the_state_the_load_and_parameters(stage):
     numbers = [random.uniform(-1.0, 1.0, e.numel()) for e in (own.state, *load)]
     # A symbol that is none of these would be refused here.
     mass, *rest = TracedFunction(
-        "stage",
-        inputs,
-        {"E": own.mass, "drift": own.drift(*load), "force": own.force(*load)},
+        "stage", inputs, {"E": own.mass, "drift": own.drift(*load), "force": own.force(*load)}
     )(*numbers, values)
     np.testing.assert_array_equal(mass, mass.T)
     assert np.linalg.eigvalsh(mass)[0] > 0.0

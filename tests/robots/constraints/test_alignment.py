@@ -4,11 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from drake_dae import (
-    AxisNormalToSurface,
-    LinkExpressions,
-    Plane,
-)
+from drake_dae import AxisNormalToSurface, LinkExpressions, Plane
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 

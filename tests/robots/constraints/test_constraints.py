@@ -10,17 +10,10 @@ import casadi as ca
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.tree import (
-    JacobianWrtVariable,
-)
+from pydrake.multibody.tree import JacobianWrtVariable
 from two_arms import APART, NOMINAL, two_arms
 
-from drake_dae import (
-    CoincidentPoints,
-    LinkExpressions,
-    WeldedFrames,
-    find_structure,
-)
+from drake_dae import CoincidentPoints, LinkExpressions, WeldedFrames, find_structure
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 

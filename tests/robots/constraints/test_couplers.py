@@ -5,11 +5,7 @@ import numpy as np
 import pytest
 from grippers import gripper, parsed
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    RevoluteJoint,
-    SpatialInertia,
-    UnitInertia,
-)
+from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
 
 from drake_dae import (
     FixedDistance,
@@ -149,10 +145,7 @@ def test_what_makes_no_sense_is_refused(make, words):
 
 @pytest.mark.parametrize(
     ("coupler", "words"),
-    [
-        (JointCoupler("right", "lef", unit="m"), "'lef'"),
-        (JointCoupler("right", "arm"), "'right'"),
-    ],
+    [(JointCoupler("right", "lef", unit="m"), "'lef'"), (JointCoupler("right", "arm"), "'right'")],
 )
 def test_a_coupler_that_does_not_fit_its_robot_is_refused(coupler, words):
     positions = [JointPositions(["arm", "left"])]

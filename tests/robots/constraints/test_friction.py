@@ -5,12 +5,7 @@ import pytest
 from arms import consistent_states, numbers, touching
 from numpy.testing import assert_allclose
 
-from drake_dae import (
-    Plane,
-    PointOnSurface,
-    RobotModel,
-    RobotPlant,
-)
+from drake_dae import Plane, PointOnSurface, RobotModel, RobotPlant
 from drake_dae.errors import ModelError
 
 

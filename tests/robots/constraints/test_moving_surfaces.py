@@ -55,11 +55,7 @@ def test_a_turning_surface_drags_a_frictional_contact_along():
         viscous_friction=viscous,
     )
     frictional = RobotModel(
-        model.links,
-        [wall],
-        model.outputs,
-        [1.2, -1.6],
-        exogenous=("wall.position", "wall.rpy"),
+        model.links, [wall], model.outputs, [1.2, -1.6], exogenous=("wall.position", "wall.rpy")
     )
     plant, random = RobotPlant(frictional), np.random.default_rng(3)
     center, rpy = random.uniform(-0.5, 0.5, (3, 3)), random.uniform(-1.0, 1.0, (3, 3))

@@ -188,10 +188,7 @@ def test_rates_are_velocities_of_the_points_that_touch():
         (lambda: Blade("a", (0, 0, 0)), "axis"),
         (lambda: RollingWheel("a", 0.0), r"'wheel\.radius'"),
         (lambda: RollingBall("a", Plane((0, 0, 0), (0, 0, 1)), -1.0), r"'ball\.radius'"),
-        (
-            lambda: RollingBall("a", Ellipsoid((0, 0, 0), (1, 2, 3)), 0.1),
-            "Ellipsoid",
-        ),
+        (lambda: RollingBall("a", Ellipsoid((0, 0, 0), (1, 2, 3)), 0.1), "Ellipsoid"),
     ],
 )
 def test_what_makes_no_sense_is_refused(make, words):

@@ -9,10 +9,7 @@ machines, and any wrong term is far above it.
 import casadi as ca
 import numpy as np
 import pytest
-from pydrake.multibody.tree import (
-    FrameIndex,
-    JacobianWrtVariable,
-)
+from pydrake.multibody.tree import FrameIndex, JacobianWrtVariable
 from random_plants import (
     assert_close,
     assert_terms_agree,
@@ -83,11 +80,7 @@ def test_frames_are_where_the_plant_has_them(seed):
     function = TracedFunction(
         "frames",
         {"q": expressions.q},
-        {
-            "R": ca.horzcat(*rotations),
-            "p": ca.horzcat(*positions),
-            "J": ca.vertcat(*jacobians),
-        },
+        {"R": ca.horzcat(*rotations), "p": ca.horzcat(*positions), "J": ca.vertcat(*jacobians)},
     )
     R, p, J = function(q)
     for i, (frame, point) in enumerate(zip(frames, points, strict=True)):

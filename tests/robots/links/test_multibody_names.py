@@ -142,14 +142,8 @@ def with_hinge():
         (lambda: one_body(revolute, finalize=False), "Finalize"),
         (lambda: "robot.urdf", "plant.*'robot.urdf'"),
         (lambda: one_body(), "'box'"),
-        (
-            lambda: one_body(QuaternionFloatingJoint),
-            "'joint'.*quaternion_floating",
-        ),
-        (
-            lambda: one_body(lambda *args: WeldJoint(*args, RigidTransform())),
-            "joint",
-        ),
+        (lambda: one_body(QuaternionFloatingJoint), "'joint'.*quaternion_floating"),
+        (lambda: one_body(lambda *args: WeldJoint(*args, RigidTransform())), "joint"),
         (with_bushing, "LinearBushingRollPitchYaw"),
         (with_hinge, "DoorHinge"),
     ],

@@ -4,10 +4,7 @@ import casadi as ca
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    RevoluteJoint,
-)
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint
 from random_plants import (
     TOLERANCE,
     assert_terms_agree,

@@ -213,20 +213,11 @@ def test_distance_from_a_torus_is_that_of_the_nearest_point():
         (lambda: Plane((0, 0, 0), (0, 0, 0)), "normal"),
         (lambda: Sphere((0, 0, 0), 0.0), "radius.*0.0"),
         (lambda: Sphere((0, 0, np.nan), 1.0), "center"),
-        (
-            lambda: Cylinder((0, 0, 0), (0, 0, 2), 1.0, zero=(0, 0, -3)),
-            "zero",
-        ),
+        (lambda: Cylinder((0, 0, 0), (0, 0, 2), 1.0, zero=(0, 0, -3)), "zero"),
         (lambda: Ellipsoid((0, 0, 0), (1, 0, 1)), "semi_axes"),
         (lambda: Torus((0, 0, 0), (0, 0, 1), 0.2, 0.3), "minor_radius"),
-        (
-            lambda: ImplicitSurface(lambda p: p).distance(ca.SX.sym("p", 3)),
-            r"\(3, 1\)",
-        ),
-        (
-            lambda: ImplicitSurface(lambda p: p[0]).coordinates(ca.SX.sym("p", 3)),
-            "ImplicitSurface",
-        ),
+        (lambda: ImplicitSurface(lambda p: p).distance(ca.SX.sym("p", 3)), r"\(3, 1\)"),
+        (lambda: ImplicitSurface(lambda p: p[0]).coordinates(ca.SX.sym("p", 3)), "ImplicitSurface"),
     ],
 )
 def test_refusals(make, message):

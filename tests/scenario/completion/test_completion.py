@@ -135,22 +135,13 @@ def test_a_start_out_of_reach_is_reported_with_the_output_and_by_how_much():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"outputs": [PointCoordinates("tool", "y")]},
-            "references: missing: tool.y",
-        ),
+        ({"outputs": [PointCoordinates("tool", "y")]}, "references: missing: tool.y"),
         (
             {"references": {"tool": ConstantReference((0.0,) * 4), "wall.force": FORCE}},
             "references.tool: 4",
         ),
-        (
-            {"references": {f"joint{k}": 0.0 for k in range(1, 8)}},
-            "references: joint1",
-        ),
-        (
-            {"references": {"tol.y": 0.0, "wall.force": FORCE}},
-            "references.tol.y: ",
-        ),
+        ({"references": {f"joint{k}": 0.0 for k in range(1, 8)}}, "references: joint1"),
+        ({"references": {"tol.y": 0.0, "wall.force": FORCE}}, "references.tol.y: "),
     ],
 )
 def test_references_that_fit_no_completion_are_refused(changes, message):

@@ -79,10 +79,7 @@ def test_what_is_given_stays(tmp_path):
     ("changes", "message"),
     [
         ({"goals": "tool.w: 0"}, r"task\.phases\.tool\.w: "),
-        (
-            {"goals": "tool.y: 5, tool.z: 0.5"},
-            "tool",
-        ),
+        ({"goals": "tool.y: 5, tool.z: 0.5"}, "tool"),
     ],
 )
 def test_what_is_not_found_is_said(changes, message, tmp_path):

@@ -32,11 +32,7 @@ from problems.mechanisms import (
     pendulum_tension,
     two_link_arm,
 )
-from problems.networks import (
-    circuit,
-    dc_motor,
-    swing_network,
-)
+from problems.networks import circuit, dc_motor, swing_network
 from problems.nonholonomic import knife_edge, knife_edge_force, rolling_disk
 from problems.problem import Array, Known, Problem, known, unconstrained
 from problems.variants import changed, in_other_units

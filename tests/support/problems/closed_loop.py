@@ -32,13 +32,7 @@ def wanted_outputs(problem: Problem, times: Array) -> Array:
 def integrated(rate: Callable[[float, Array], Array], start: Array, times: Array) -> Array:
     """The states of x' = rate(t, x), shape (k, n), by SciPy's DOP853 with tolerances of 1e-11."""
     solution = solve_ivp(
-        rate,
-        (times[0], times[-1]),
-        start,
-        method="DOP853",
-        t_eval=times,
-        rtol=1e-11,
-        atol=1e-12,
+        rate, (times[0], times[-1]), start, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-12
     )
     assert solution.success, solution.message
     return solution.y.T

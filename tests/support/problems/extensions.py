@@ -5,10 +5,7 @@ import numpy as np
 
 from drake_dae.dae import DaeSystem, Extension, Signal, dynamic_extension
 from drake_dae.trace.functions import TracedFunction
-from problems import (
-    PROBLEMS,
-    changed,
-)
+from problems import PROBLEMS, changed
 
 GRAVITY = 9.81
 

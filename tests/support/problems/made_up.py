@@ -82,11 +82,7 @@ def third_order() -> Problem:
 
     def derivatives(x: Array) -> Array:
         return np.array(
-            [
-                x[0] - x[3] ** 2,
-                x[1] - 2 * x[3] * x[4],
-                x[2] - 2 * x[4] ** 2 - 2 * x[3] * x[5],
-            ]
+            [x[0] - x[3] ** 2, x[1] - 2 * x[3] * x[4], x[2] - 2 * x[4] ** 2 - 2 * x[3] * x[5]]
         )
 
     return Problem(

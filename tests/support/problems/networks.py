@@ -90,11 +90,7 @@ def swing_network() -> Problem:
         stiff = np.array(links) * np.cos([x[0] - x[4], x[2] - x[4]])
         drift = power[0] - damping[0] * x[1] - links[0] * np.sin(x[0] - x[4])
         return known(
-            -stiff.sum(),
-            stiff @ [x[1], x[3]] / stiff.sum(),
-            0,
-            drift / inertia[0],
-            1 / inertia[0],
+            -stiff.sum(), stiff @ [x[1], x[3]] / stiff.sum(), 0, drift / inertia[0], 1 / inertia[0]
         )
 
     def consistent(random: np.random.Generator) -> Array:

@@ -129,10 +129,7 @@ def rolling_disk() -> Problem:
             [-radius * ca.cos(x[2]) / inertia, -radius * ca.sin(x[2]) / inertia],
         ],
         h=lambda x: [*[[0, 0]] * 6, [0, 1 / spin], [1 / inertia, 0]],
-        k=lambda x: [
-            x[4] - radius * ca.cos(x[2]) * x[7],
-            x[5] - radius * ca.sin(x[2]) * x[7],
-        ],
+        k=lambda x: [x[4] - radius * ca.cos(x[2]) * x[7], x[5] - radius * ca.sin(x[2]) * x[7]],
         l=lambda x: [x[2], x[3]],
         m=lambda x: [[0, 0], [0, 0]],
         output_signals=["heading", "roll"],

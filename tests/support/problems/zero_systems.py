@@ -129,10 +129,7 @@ def free_arm() -> DaeSystem:
     """A planar arm with links 1.0 and 0.8 and unit inertias, z the position of its tip."""
 
     def tip(q):
-        return [
-            ca.cos(q[0]) + 0.8 * ca.cos(q[0] + q[1]),
-            ca.sin(q[0]) + 0.8 * ca.sin(q[0] + q[1]),
-        ]
+        return [ca.cos(q[0]) + 0.8 * ca.cos(q[0] + q[1]), ca.sin(q[0]) + 0.8 * ca.sin(q[0] + q[1])]
 
     return DaeSystem.from_functions(
         ["q1", "q2", "v1", "v2"],

@@ -249,13 +249,7 @@ def resting_loop(model, structure, gains, sensor=None, **force_feedback):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("seven_joint", None),
-        ("two_link", "flexible motor"),
-    ],
-)
+@pytest.mark.parametrize(("name", "kind"), [("seven_joint", None), ("two_link", "flexible motor")])
 def test_closed_loops_have_the_assigned_poles(name, kind):
     """mu_i poles for each output, and sum r_i zeros: k^(r) = 0 lets a drift off N* stay."""
     found = actuated(name, kind) if kind else arm(name)
@@ -306,12 +300,7 @@ def test_failures_name_time_and_state():
 def test_a_function_without_derivative_is_named():
     """x' = sqrt(x) + u is 0 at x = 0, where its derivative is infinite."""
     system = dd.DaeSystem.from_functions(
-        1,
-        f=lambda x: ca.sqrt(x),
-        h=lambda x: 1,
-        l=lambda x: x,
-        nominal_state=[1.0],
-        name="root",
+        1, f=lambda x: ca.sqrt(x), h=lambda x: 1, l=lambda x: x, nominal_state=[1.0], name="root"
     )
     plant = dd.DaePlant(system)
     context = plant.CreateDefaultContext()

@@ -93,14 +93,8 @@ def hold(values):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda: dd.ReferenceGenerator([dd.ConstantReference(1.0)], [2, 2]),
-            r"1.*2",
-        ),
-        (
-            lambda: dd.ReferenceGenerator([dd.PointToPointReference(0, 1, 0, 1)], [4]),
-            "order=4",
-        ),
+        (lambda: dd.ReferenceGenerator([dd.ConstantReference(1.0)], [2, 2]), r"1.*2"),
+        (lambda: dd.ReferenceGenerator([dd.PointToPointReference(0, 1, 0, 1)], [4]), "order=4"),
         (
             lambda: dd.ReferenceGenerator([TrajectoryReference(hold([0, 1, 0]))], [2]),
             r"row 0.*-2.*t = 1 s",
@@ -111,10 +105,7 @@ def hold(values):
         (lambda: dd.SinusoidReference(0.0, "a", 1.0), "amplitudes"),
         (lambda: dd.SinusoidReference(0.0, [1, 2], [1, 2, 3]), r"amplitudes.*2.*frequencies.*3"),
         (lambda: dd.ExpressionReference(lambda t: ca.SX.sym("a") * t), r"\ba\b"),
-        (
-            lambda: TrajectoryReference(PiecewisePolynomial(np.eye(2))),
-            "2 x 2",
-        ),
+        (lambda: TrajectoryReference(PiecewisePolynomial(np.eye(2))), "2 x 2"),
     ],
 )
 def test_refusals(make, message):

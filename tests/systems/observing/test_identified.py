@@ -327,10 +327,7 @@ def test_a_contact_breaks_away_for_the_first_time_without_a_swing():
 def test_behind_springs_friction_does_not_jump():
     """The tracking law differentiates the estimates; with a jump it loses the contact at 0.7 s."""
     loop, context = build_scenario(
-        load_scenario(
-            "wall_flexible_contact",
-            ["plant.time_step=0.001"],
-        )
+        load_scenario("wall_flexible_contact", ["plant.time_step=0.001"])
     )
     start, parameters = start_values(loop, context)
     (run,) = rollout(loop, start, parameters, np.linspace(0.0, 1.0, 1001))

@@ -250,10 +250,7 @@ def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monk
     ("maker", "told"),
     [
         ("members", "plant.maker: "),
-        (
-            "no_such_module:Plant",
-            r"plant\.maker: .*'no_such_module:Plant'",
-        ),
+        ("no_such_module:Plant", r"plant\.maker: .*'no_such_module:Plant'"),
         ("members:NoSuchPlant", r"plant\.maker: .*'NoSuchPlant'"),
     ],
 )

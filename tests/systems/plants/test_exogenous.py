@@ -30,10 +30,7 @@ def rod(exogenous=("length",), **fields):
         "name": "rod",
     }
     return dd.DaeSystem.from_functions(
-        ["x", "y", "vx", "vy"],
-        **(given | fields),
-        parameters={"length": 1.0},
-        exogenous=exogenous,
+        ["x", "y", "vx", "vy"], **(given | fields), parameters={"length": 1.0}, exogenous=exogenous
     )
 
 

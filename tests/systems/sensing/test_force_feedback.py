@@ -20,15 +20,7 @@ HOLD = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
 
 
 def run(
-    model,
-    references,
-    *,
-    measured=False,
-    gain=0.0,
-    sensor=None,
-    duration=4.0,
-    wrong=1.1,
-    felt=0.0,
+    model, references, *, measured=False, gain=0.0, sensor=None, duration=4.0, wrong=1.1, felt=0.0
 ):
     """The two-link arm under a law whose model has another mass of link 2.
 

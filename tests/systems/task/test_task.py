@@ -212,20 +212,14 @@ def controller_of(phases, law, free_law, period=PERIOD):
         (lambda: dd.Task([dd.Approach()], contact_force=0.0), "contact_force"),
         (lambda: controller_of([dd.Approach()], laws()[0], laws()[0]), "contact"),
         (lambda: controller_of([dd.Approach()], *laws(), 0.0), "sample_period"),
-        (
-            lambda: controller_of([dd.Move({"tool.x": 1.0}, 1.0)], *laws()),
-            r"Move: .*'tool\.x'",
-        ),
+        (lambda: controller_of([dd.Move({"tool.x": 1.0}, 1.0)], *laws()), r"Move: .*'tool\.x'"),
         (
             lambda: task_loop(
                 [dd.Approach(), dd.Move({"wall.distance": dd.ConstantReference(1.0)}, 1.0)]
             ),
             r"'wall\.distance'",
         ),
-        (
-            lambda: open_contact(laws()[0].system, "floor.force"),
-            r"'floor\.force'",
-        ),
+        (lambda: open_contact(laws()[0].system, "floor.force"), r"'floor\.force'"),
     ],
 )
 def test_wrong_numbers_and_names_are_refused(make, message):

@@ -1,4 +1,4 @@
-"""Drake's contact results as constraint forces."""
+"""Drake's generalized contact forces, or its contact results, as constraint forces."""
 
 from collections.abc import Sequence
 

@@ -275,6 +275,18 @@ def run_sled(time_step, pull, duration, **material):
     return plant.state(own)
 
 
+@pytest.mark.slow
+def test_creep_at_half_the_friction_limit_tells_the_two_laws_apart():
+    """step5(s) = 1/2 at s = 1/2, and s / sqrt(1 + s^2) = 1/2 at 1 / sqrt(3).
+
+    After 0.1 s the start has decayed by e^-100 and more.
+    """
+    tolerance = 1e-3
+    for time_step, share in ((0.0, 0.5), (1e-4, 1.0 / np.sqrt(3.0))):
+        state = run_sled(time_step, 2.5, 0.1, stiction_tolerance=tolerance)
+        assert_allclose(state[2], share * tolerance, rtol=1e-8)
+
+
 @pytest.mark.parametrize("steps", [1.0, 2.0])
 def test_friction_settles_with_fixed_steps_up_to_m_v_s_by_mu_f_n(steps):
     """Where step5 is steepest; the step is 15/8 of the time constant of friction, or 15/4.

@@ -245,10 +245,7 @@ def test_wall_may_stand_elsewhere_than_the_law_believes():
         ),
         (["robot.known_forces=[{frame: tool}]"], r"robot.known_forces.*plant.disturbances"),
         (["plant.parameters={link1.mas: [1.0]}"], r"'link1\.mas'"),
-        (
-            ["constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 1.3, inside: true}"],
-            "wall",
-        ),
+        (["constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 1.3, inside: true}"], "wall"),
         (
             [
                 "constraints.0.surface=!Cylinder {point: [1, 0, 0], axis: [0, 0, 1], radius: 0.2}",
