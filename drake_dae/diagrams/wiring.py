@@ -247,7 +247,12 @@ def log_steps(builder: DiagramBuilder, ports: Sequence[OutputPort], plant: Plant
     stacked.set_name("logged_signals")
     for index, port in enumerate(ports):
         builder.Connect(port, stacked.get_input_port(index))
+    port = stacked.get_output_port()
     # After the last step of a run the state of a discrete plant belongs to a time that the run has
-    # not reached.
-    trigger = TriggerType.kPeriodic if plant.time_step else TriggerType.kPerStep
-    return LogVectorOutput(stacked.get_output_port(), builder, {trigger}, plant.time_step)
+    # not reached. Drake's LogVectorOutput with a period keeps the diagram alive (1.51).
+    if plant.time_step:
+        sink = VectorLogSink(port.size(), {TriggerType.kPeriodic}, plant.time_step)
+        log = builder.AddSystem(sink)
+        builder.Connect(port, log.get_input_port())
+        return log
+    return LogVectorOutput(port, builder, {TriggerType.kPerStep})

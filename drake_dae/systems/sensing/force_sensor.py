@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, numbers, vector
+from drake_dae.arrays import FloatArray, brief, check_whole_number, numbers, vector
 from drake_dae.blocks.block import TIME, Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
@@ -61,6 +61,7 @@ class ForceSensor(TracedSystem):
         drift: ArrayLike = 0.0,
     ) -> None:
         self.time_constant, self.sample_period = time_constant, sample_period
+        check_whole_number("the size of a ForceSensor", size, 1)
         errors = _errors(size, bias, noise_deviation, drift)
         for name, value in (("time_constant", time_constant), ("sample_period", sample_period)):
             if not 0.0 <= value < np.inf:
@@ -107,6 +108,7 @@ class ForceSensor(TracedSystem):
         """
         self.check_context(context)
         size = self.block.inputs["force"].numel()
+        check_whole_number("the size of a ForceSensor", size, 1)
         errors = _errors(size, bias, noise_deviation, drift)
         if errors[size : 2 * size].any() and "noise" not in self.block.inputs:
             raise ModelError("a ForceSensor that was made without noise has no port for it")
