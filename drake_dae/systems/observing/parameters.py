@@ -14,8 +14,9 @@ GAP = 1e-5
 COMPLIANCE = 3e-5, 1e-4
 """The standard deviations of a contact's unknown compliances c_1 in m/N and c_2 in m/N^(1/2)."""
 
-MEMORY = 100.0
-"""The time in s in which a mass or a friction may move by its range."""
+MEMORY, NOISY_MEMORY = 100.0, 1000.0
+"""The times in s in which a mass or a friction may move by its range: with a measured state, and
+with an estimated one, whose noise moves what the motion does not excite."""
 
 FADING = 10.0
 """The time in s in which what was measured of a place or a compliance fades. It covers the motion
@@ -53,7 +54,7 @@ class ParameterFilter:
     without which the first samples count for too much.
 
     P_0 is the variance of numbers that are equally likely within their bounds. Masses and frictions
-    change: their P returns to P_0 in `MEMORY`. What was measured of places and compliances fades
+    change: their P returns to P_0 in `memory` s. What was measured of places and compliances fades
     with the time constant F = `FADING`, since no model of a surface is exact:
 
         (P^-1)' = (P_0^-1 - P^-1) / F,    P' = (P - P P_0^-1 P) / F.
@@ -70,6 +71,7 @@ class ParameterFilter:
         largest_friction: Their upper bound.
         rate: k_o in 1/s.
         period: The time between samples of the filter in s.
+        memory: `MEMORY` or `NOISY_MEMORY`, in s.
     """
 
     def __init__(
@@ -80,8 +82,10 @@ class ParameterFilter:
         largest_friction: float,
         rate: float,
         period: float,
+        memory: float = MEMORY,
     ) -> None:
         self._period, self._samples = period, max(2.0 / (rate * period), 1.0)
+        self._memory = memory
         self._low = np.concatenate([within[0], np.zeros(frictions)])
         self._high = np.concatenate([within[1], np.full(frictions, largest_friction)])
         self._num, self._contacts = self._low.size, len(identified.pressed)
@@ -164,7 +168,7 @@ class ParameterFilter:
     def _forgotten(self) -> ca.SX:
         """P a sample later."""
         fades, P = self._fades, self._covariance
-        share = (1.0 - fades) * self._period / MEMORY
+        share = (1.0 - fades) * self._period / self._memory
         kept = ca.SX(np.outer(fades, fades)) * P
         grown = kept - ca.mtimes([kept, ca.DM(np.diag(1.0 / self._prior)), kept])
         keep = 1.0 - share / 2.0

@@ -14,7 +14,7 @@ from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.contacts import LITTLE, Contacts, ContactTerms
 from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.observing.parameters import ParameterFilter, Regressor
+from drake_dae.systems.observing.parameters import MEMORY, NOISY_MEMORY, ParameterFilter, Regressor
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
 _PARAMETER_PERIOD, _NOISY_PERIOD = 0.01, 0.002
@@ -107,10 +107,10 @@ class EstimatorSample:
             "theta": values[self._places].tolist(),
         }
         self._memory = {name: ca.SX.sym(name, len(value)) for name, value in start.items()}
-        wanted = _NOISY_PERIOD if estimates else _PARAMETER_PERIOD
+        wanted, memory = (_NOISY_PERIOD, NOISY_MEMORY) if estimates else (_PARAMETER_PERIOD, MEMORY)
         slower = max(round(wanted / period), 1) * period
         within, most = estimated_within(theta, observing.ranges), observing.largest_friction
-        self._filter = ParameterFilter(identified, within, c, most, rates[0], slower)
+        self._filter = ParameterFilter(identified, within, c, most, rates[0], slower, memory)
         self._ratio = round(slower / period)
         self._regressor = Regressor(system, observation, rates, slower, self._ratio, not estimates)
         self._before = self._adopted()
