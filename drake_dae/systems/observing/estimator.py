@@ -37,8 +37,7 @@ class StateEstimator(ParameterizedSystem):
     that `with_disturbance` made exogenous, and friction beside them, follow by `ParameterFilter`.
 
     Input ports:
-        measured_state: x, shape (n,). With a state_rate velocities count if their noise is
-            given, and at the first sample.
+        measured_state: x, shape (n,). With a state_rate velocities count if they have noise.
         control, measured_force: The applied u, shape (p,); v, shape (m,), if the law measures it.
         hold: Not 0 while a drive is at its limit: mu and parameters then rest.
         reference: R of the controller; the current outputs and rates without a wire.
@@ -54,8 +53,7 @@ class StateEstimator(ParameterizedSystem):
     Args:
         law, observing, sample_period: Of a system that `with_disturbance` made; the rates; T in s.
         control_lag: The share of T for which the previous control acts, at most 1.
-        control_delay: The mean time from a sample until its control acts, in s.
-        plant_step: The step of a discrete plant in s; 0 for a continuous one.
+        control_delay, plant_step: The mean time until a control acts; a discrete plant's step; in s.
         position_deviation, velocity_deviation: Of measurements; 0 for velocities not measured.
         is_ideal: Whether contacts are ideal, with the friction of the model.
 
