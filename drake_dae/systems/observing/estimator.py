@@ -53,7 +53,7 @@ class StateEstimator(ParameterizedSystem):
     Args:
         law, observing, sample_period: Of a system that `with_disturbance` made; the rates; T in s.
         control_lag: The share of T for which the previous control acts, at most 1.
-        control_delay, plant_step: The mean time until a control acts; a discrete plant's step; in s.
+        control_delay, plant_step: The mean time until a control acts, and a plant's step, in s.
         position_deviation, velocity_deviation: Of measurements; 0 for velocities not measured.
         is_ideal: Whether contacts are ideal, with the friction of the model.
 
