@@ -76,7 +76,7 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         (folder / file).unlink(missing_ok=True)
     first_line = f"# Scenario as run by drake-dae {drake_dae.__version__}"
     save_scenario(scenario, folder / SCENARIO, first_line)
-    recorded: RecordAfter = lambda after: loop.record(context, after)  # noqa: E731
+    recorded: RecordAfter = partial(loop.record, context)
     statistics, reason, results, problems = None, "", dict[str, Any](), list[str]()
 
     def see(record: RecordAfter) -> bool:

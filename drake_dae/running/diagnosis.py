@@ -40,7 +40,7 @@ IMPLICIT = ("implicit", "velocity_implicit", "radau")  # Stiffness does not limi
 LONGEST = 1.7
 # A run is looked at each so many steps; below this share of the longest mean they collapsed.
 EVERY, COLLAPSED = 32, 1e-5
-# The steps after which the pace of a run is looked at; as many as this in all are told of.
+# The steps after which the pace of a run is examined, and those from which a run counts as long.
 PACE, MANY = 2000, 100_000
 
 IN_SIMULATE = "Choose integration_scheme 'radau3' or 'implicit_euler', or a slower model"

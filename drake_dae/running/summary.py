@@ -21,7 +21,7 @@ from drake_dae.running.judgement import (
 )
 from drake_dae.running.simulate import RunStatistics
 
-WIDTH, MOST = 100, 6  # The width of a paragraph; the most findings that are told beside the first.
+WIDTH, MOST = 100, 6  # The width of a paragraph; the most findings that follow the first one.
 UNEXCITED = 0.5  # A parameter is not excited whose deviation is above this share of that at first.
 SURE = 2.0  # The number of deviations from which an estimate differs from what the law believes.
 
@@ -96,7 +96,7 @@ class RunSummary(Judgement):
             size = sizes.get(signal.unit, 0.0)
             return "0" if abs(value) <= ROUND_OFF * size else f"{value:.{digits}g}"
 
-        # Findings; the prediction is told below the table, unless it decides.
+        # Findings; the prediction stands below the table, unless it decides.
         off = [f for f in self.findings if f.kind is FindingKind.PREDICTION and not f.decides]
         told = [f for f in self.findings[1:] if f not in off]
         head = [fill(str(self), WIDTH)]

@@ -33,7 +33,7 @@ PATCH_FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
 
 _BEYOND = 2.0
-"""A run is told whose errors are larger than the stated ones by this factor."""
+"""A run is reported whose errors exceed the stated ones by this factor."""
 
 _STATES = 33
 """The number of states along the references at which friction is compared with what jams."""
@@ -145,7 +145,7 @@ def stated_errors(
     )
     try:
         across, along = (Part.of(sensed, 0.0, own, bool(i)).error for i, own in enumerate(rates))
-    except ModelError:  # Of a state_rate, which is told where it is used.
+    except ModelError:  # Of a state_rate, which is reported where it is used.
         return None
     found = across, float(np.hypot(along, _bias(scenario)))
     return found if isfinite(sum(found)) else None
@@ -233,7 +233,7 @@ def jam(scenario: Scenario, model: RobotModel, structure: Structure, friction: f
         motion = ZeroDynamics(system, structure=structure).motion(
             reference, times, start, exogenous=exogenous
         )
-    except DrakeDaeError:  # What is wrong with references and start is told where they are used.
+    except DrakeDaeError:  # Wrong references and starts are reported where they are used.
         return ""
     if not motion.times.size:
         return ""

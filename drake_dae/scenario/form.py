@@ -205,7 +205,7 @@ def _told(error: ErrorDetails, tag: str, names: Sequence[str], no_tag: str) -> I
 
 
 def _problem(text: str, wrong: str = "") -> PydanticCustomError:
-    """A problem that is told, with the wrong key if it is about one."""
+    """A problem to report, with the wrong key if it is about one."""
     return PydanticCustomError("told", "{text}", {"text": text, "wrong": wrong})
 
 

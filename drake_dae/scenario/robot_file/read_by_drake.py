@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 
 from drake_dae.arrays import number_in
 
-# "owner: parts that Drake reads | parts that change no equation | parts that are told, no error".
+# "owner: parts that Drake reads | parts that change no equation | parts that are reported".
 # Of "a=0" that holds with this value only, of "a=never" with none; "*" is all others. Owners
 # without a line hold geometry. "limit@ball" has what is different in joints of this type.
 _URDF = """
@@ -155,7 +155,7 @@ _RULES: dict[str, Callable[[str], bool]] = {
 
 
 class _Part(NamedTuple):
-    """How Drake takes a part: it reads it, or what value of it is without effect, or it is told."""
+    """How Drake takes a part: it reads it, a value of it is without effect, or it is reported."""
 
     is_read: bool = False
     meant: str = "never"
@@ -182,7 +182,7 @@ READ_BY_DRAKE = {".urdf": _table(_URDF), ".sdf": _table(_SDF), ".xml": _table(_M
 class Lost(NamedTuple):
     """What Drake does not read: "<parent>/<name>", its value, and the element to which it belongs.
 
-    What Drake does not read of joints of one type is "<type>/<name>". It is told, or refused.
+    What Drake does not read of joints of one type is "<type>/<name>". It is reported, or refused.
     """
 
     part: str

@@ -107,10 +107,12 @@ class EstimatorSample:
             "theta": values[self._places].tolist(),
         }
         self._memory = {name: ca.SX.sym(name, len(value)) for name, value in start.items()}
-        wanted, memory = (_NOISY_PERIOD, NOISY_MEMORY) if estimates else (_PARAMETER_PERIOD, MEMORY)
+        wanted, lasting = (
+            (_NOISY_PERIOD, NOISY_MEMORY) if estimates else (_PARAMETER_PERIOD, MEMORY)
+        )
         slower = max(round(wanted / period), 1) * period
         within, most = estimated_within(theta, observing.ranges), observing.largest_friction
-        self._filter = ParameterFilter(identified, within, c, most, rates[0], slower, memory)
+        self._filter = ParameterFilter(identified, within, c, most, rates[0], slower, lasting)
         self._ratio = round(slower / period)
         self._regressor = Regressor(system, observation, rates, slower, self._ratio, not estimates)
         self._before = self._adopted()
@@ -414,8 +416,8 @@ class EstimatorSample:
                 goal, valid = self._contacts.goal(x, parameters)
             estimated = {p.name for p in observation.identified.parameters}
             viscous = {f"{name.rpartition('.')[0]}.viscous" for name in system.dry}
-            rubbing = self._proportional_to({*system.dry, *(viscous & estimated)})
-            joints = ca.Function("rubbing", [system.state, system.parameter_symbol], [rubbing])
+            friction = self._proportional_to({*system.dry, *(viscous & estimated)})
+            joints = ca.Function("joints", [system.state, system.parameter_symbol], [friction])
             contact = observation.friction.function
             now, wanted = (
                 ca.mtimes(contact(faster, v, parameters)[0], mu) + joints(state, parameters)

@@ -93,9 +93,9 @@ def point_contacts(
         normal, depth = _overlap(touch, ball, radius)
         contact = ball - normal * (radius - depth / 2)
         moves, drags = ca.substitute([jacobian, velocity], [point], [contact])
-        rubs = own, coefficients["viscous_friction"]
-        gives = stiffness, dissipation, material.stiction_tolerance
-        contacts.append(PointContact(depth, normal, moves, drags, *rubs, *gives))
+        resistance = own, coefficients["viscous_friction"]
+        spring = stiffness, dissipation, material.stiction_tolerance
+        contacts.append(PointContact(depth, normal, moves, drags, *resistance, *spring))
     return contacts
 
 
