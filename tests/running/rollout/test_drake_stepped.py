@@ -30,8 +30,9 @@ LOOPS = {
     "a law that acts late, at another period": ("two_link_wall", *CONTINUOUS, LATE),
     "noise": ("wall_point_contact", NOISE),
     "a push": (
-        "wall_point_contact",
-        "plant.disturbances=[{frame: link7, start_time: 0.01, end_time: 0.03, force: [5, 0, 0]}]",
+        "two_link_wall",
+        *CONTINUOUS,
+        "plant.disturbances=[{frame: link2, start_time: 0.01, end_time: 0.03, force: [5, 0, 5]}]",
     ),
     "a start between two steps": ("wall_point_contact", "integrator.start_time=0.0104"),
 }
