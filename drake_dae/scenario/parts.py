@@ -146,7 +146,7 @@ class Sensors:
     @property
     def force_noise(self) -> float:
         """The largest standard deviation of the noise of the measured force, in N or N m."""
-        return 0.0 if self.force is None else float(np.max(self.force.noise_deviation))
+        return 0.0 if self.force is None else float(np.asarray(self.force.noise_deviation).max())
 
 
 @dataclass(frozen=True)
