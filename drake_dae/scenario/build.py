@@ -24,7 +24,7 @@ from drake_dae.dae import (
     outputs_named,
     with_disturbance,
 )
-from drake_dae.dae.beyond.disturbance import estimated_within
+from drake_dae.dae.disturbance import estimated_within
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop

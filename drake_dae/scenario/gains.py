@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_dae.dae import AdvisedGains, ContactGains, Structure, advised_gains, contact_gains
-from drake_dae.dae.beyond.advised_gains import settles_along
+from drake_dae.dae.advised_gains import settles_along
 from drake_dae.errors import GainError, ScenarioError
 from drake_dae.robots import JointFriction, Plane, PointOnSurface, RobotModel, velocities_are_rates
 from drake_dae.scenario import parts as parts

@@ -12,7 +12,7 @@ from runs import scenario
 from drake_dae import build_scenario, contact_gains, load_scenario, simulate
 from drake_dae.cli import main
 from drake_dae.dae import Parameter, advised_gains
-from drake_dae.dae.beyond.disturbance import estimated_within
+from drake_dae.dae.disturbance import estimated_within
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import build, plants
 from drake_dae.scenario import parts as parts
