@@ -1,24 +1,23 @@
 """The names of the room, each with its home, in the order of the paper."""
 
+from .advised_gains import AdvisedGains as AdvisedGains
+from .advised_gains import SensedContact as SensedContact
+from .advised_gains import advised_gains as advised_gains
 from .assumptions import Violation as Violation
 from .assumptions import ViolationKind as ViolationKind
-from .beyond.advised_gains import AdvisedGains as AdvisedGains
-from .beyond.advised_gains import SensedContact as SensedContact
-from .beyond.advised_gains import advised_gains as advised_gains
-from .beyond.contact_gains import ContactGains as ContactGains
-from .beyond.contact_gains import contact_damping as contact_damping
-from .beyond.contact_gains import contact_gains as contact_gains
-from .beyond.disturbance import IdentifiedTerms as IdentifiedTerms
-from .beyond.disturbance import Observation as Observation
-from .beyond.disturbance import with_disturbance as with_disturbance
-from .beyond.filters import Lags as Lags
-from .beyond.one_direction import SensorNoise as SensorNoise
+from .contact_gains import ContactGains as ContactGains
+from .contact_gains import contact_damping as contact_damping
+from .contact_gains import contact_gains as contact_gains
 from .contacts import UnilateralInput as UnilateralInput
 from .derivatives import Derivatives as Derivatives
+from .disturbance import IdentifiedTerms as IdentifiedTerms
+from .disturbance import Observation as Observation
+from .disturbance import with_disturbance as with_disturbance
 from .elimination import Elimination as Elimination
 from .extension import Extension as Extension
 from .extension import dynamic_extension as dynamic_extension
 from .fields import as_expression as as_expression
+from .filters import Lags as Lags
 from .gains import FeedbackGains as FeedbackGains
 from .gains import GainDesign as GainDesign
 from .gains import gain_coefficients as gain_coefficients
@@ -33,6 +32,7 @@ from .manifold import Manifold as Manifold
 from .margins import ContactMargin as ContactMargin
 from .margins import RankMargin as RankMargin
 from .normal_form import NormalForm as NormalForm
+from .one_direction import SensorNoise as SensorNoise
 from .pinned_motion import EndCause as EndCause
 from .pinned_motion import MotionEnd as MotionEnd
 from .pinned_motion import PinnedMotion as PinnedMotion

@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Observation
-from drake_dae.dae.beyond.friction_share import Metric, shares
+from drake_dae.dae.friction_share import Metric, shares
 from drake_dae.systems.observing.observing import Observing
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
