@@ -32,9 +32,13 @@ from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.estimated import estimates_all, with_all_estimated, with_friction_estimated
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.gains import advised
+from drake_dae.scenario.gains import (
+    advised,
+    estimates_all,
+    with_all_estimated,
+    with_friction_estimated,
+)
 from drake_dae.scenario.model import (
     completed_model,
     exogenous_references,
