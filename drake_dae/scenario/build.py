@@ -24,7 +24,7 @@ from drake_dae.dae import (
     outputs_named,
     with_disturbance,
 )
-from drake_dae.dae.beyond.disturbance import estimated_within
+from drake_dae.dae.disturbance import estimated_within
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
@@ -32,9 +32,13 @@ from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.estimated import estimates_all, with_all_estimated, with_friction_estimated
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.gains import advised
+from drake_dae.scenario.gains import (
+    advised,
+    estimates_all,
+    with_all_estimated,
+    with_friction_estimated,
+)
 from drake_dae.scenario.model import (
     completed_model,
     exogenous_references,

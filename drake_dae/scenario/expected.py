@@ -11,10 +11,10 @@ from scipy.linalg import expm
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import SensedContact, SensorNoise, Structure, ZeroDynamics
-from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR, RAMP, Part
-from drake_dae.dae.beyond.one_direction import DirectionGains
+from drake_dae.dae.advised_gains import EVERY, MODEL_ERROR, RAMP, Part
 from drake_dae.dae.law_model import damping_gains
 from drake_dae.dae.margins import ContactMargins
+from drake_dae.dae.one_direction import DirectionGains
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.references import Reference

@@ -6,7 +6,7 @@ import pytest
 
 from drake_dae import DaeSystem
 from drake_dae.dae import IdentifiedTerms, Parameter
-from drake_dae.dae.beyond.disturbance import estimated_within
+from drake_dae.dae.disturbance import estimated_within
 from drake_dae.systems.estimator_parameters import FADING, ParameterFilter, _pushes
 
 RATE, PERIOD, PLACE = 20.0, 0.002, 3e-3

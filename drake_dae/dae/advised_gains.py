@@ -10,8 +10,8 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number, positive
-from drake_dae.dae.beyond.contact_gains import ContactGains, best_damping
-from drake_dae.dae.beyond.one_direction import Direction, DirectionGains, SensorNoise, sampled_loop
+from drake_dae.dae.contact_gains import ContactGains, best_damping
+from drake_dae.dae.one_direction import Direction, DirectionGains, SensorNoise, sampled_loop
 from drake_dae.errors import GainError, ModelError
 
 _PHASE = 0.3

@@ -3,7 +3,7 @@
 import pytest
 
 from drake_dae.dae import SensedContact, SensorNoise, advised_gains
-from drake_dae.dae.beyond.one_direction import Direction, DirectionGains, sampled_loop
+from drake_dae.dae.one_direction import Direction, DirectionGains, sampled_loop
 from drake_dae.errors import GainError, ModelError
 
 T, ROUGHNESS = 1e-3, 1.0

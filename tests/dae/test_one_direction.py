@@ -9,8 +9,8 @@ from runs import some
 from scipy.integrate import solve_ivp
 
 from drake_dae.dae import SensorNoise
-from drake_dae.dae.beyond.filters import ChainFilter, transition
-from drake_dae.dae.beyond.one_direction import Direction, DirectionGains, sampled_loop
+from drake_dae.dae.filters import ChainFilter, transition
+from drake_dae.dae.one_direction import Direction, DirectionGains, sampled_loop
 
 T = 1e-3
 FREE = DirectionGains((15.0**3, 2.0 * 15.0**2, 30.0), 0.0, 20.0)
