@@ -14,13 +14,12 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, vector
 from drake_dae.dae import DaeSystem, Parameter, Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.actuation.stage import ActuationChain, Stage, chain, diagonal_parameter
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.constraints.constraint_set import ConstraintSet, LoopState
-from drake_dae.robots.constraints.couplers import plant_constraints
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots.actuation import ActuationChain, Stage, chain, diagonal_parameter
+from drake_dae.robots.constraint import Constraint, ConstraintSet, LoopState
+from drake_dae.robots.couplers import plant_constraints
+from drake_dae.robots.links import Links
 from drake_dae.robots.loads import Load
+from drake_dae.robots.multibody import MultibodyExpressions
 from drake_dae.robots.outputs import ForceOutput, PositionOutput, as_force_outputs, force_rows
 from drake_dae.robots.statics import StaticBalance, StaticPlacement
 from drake_dae.trace.compiled import Compiled

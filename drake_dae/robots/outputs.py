@@ -10,10 +10,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
 from drake_dae.dae import Signal, as_expression
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.links.links import Kinematics, Links, position_index
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots.constraint import Constraint, ConstraintSet
+from drake_dae.robots.links import Kinematics, Links, position_index
+from drake_dae.robots.surface import Vector
 from drake_dae.trace.expressions import length_of, result_of
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.links.links import Links
+from drake_dae.robots.links import Links
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps

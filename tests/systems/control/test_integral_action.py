@@ -6,7 +6,6 @@ from arms import arm, error_controlled, law, numbers, touching
 from numpy.testing import assert_allclose
 
 import drake_dae as dd
-from drake_dae.dae import linearize_loop
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots import KnownForce
@@ -126,6 +125,3 @@ def test_what_makes_no_sense_is_refused():
     controller, context = controller_of()
     with pytest.raises(ModelError, match="integral"):
         controller.set_integral(context, [0.0, 0.0])
-    state = found.structure.states[0]
-    with pytest.raises(ModelError, match="state"):
-        linearize_loop(controller.law, state, np.zeros(4))

@@ -14,11 +14,11 @@ from pydrake.solvers import LinearEqualityConstraint, MathematicalProgram
 from drake_dae.arguments import checked
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.constraints.points import FixedDistance
-from drake_dae.robots.links.links import Application, Frames, Kinematics, Links, position_index
-from drake_dae.robots.links.plant_frames import frame_name, joint_names
-from drake_dae.robots.surfaces.surface import triple
+from drake_dae.robots.constraint import Constraint
+from drake_dae.robots.links import Application, Frames, Kinematics, Links, position_index
+from drake_dae.robots.loops import FixedDistance
+from drake_dae.robots.plant_frames import frame_name, joint_names
+from drake_dae.robots.surface import triple
 
 
 @checked(ModelError)

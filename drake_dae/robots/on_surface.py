@@ -13,9 +13,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Constraint, Touch
-from drake_dae.robots.links.links import Application, Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.surface import (
+from drake_dae.robots.constraint import Constraint, Touch
+from drake_dae.robots.links import Application, Frames, Kinematics, Reaction
+from drake_dae.robots.surface import (
     Surface,
     Vector,
     axes_along,

@@ -13,9 +13,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.links.links import Application, Frames, Kinematics
-from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
+from drake_dae.robots.constraint import Constraint
+from drake_dae.robots.links import Application, Frames, Kinematics
+from drake_dae.robots.surface import Surface, Vector, unit_vector
 from drake_dae.trace.expressions import length_of
 
 

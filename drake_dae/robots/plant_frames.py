@@ -27,8 +27,8 @@ from pydrake.multibody.tree import (
 
 from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.links import Outline
-from drake_dae.robots.links.tree import ElementaryJoint, TreeLink
+from drake_dae.robots.links import Outline
+from drake_dae.robots.tree import ElementaryJoint, TreeLink
 
 MOST_CORNERS = 200
 """The largest number of points of a mesh."""

@@ -17,8 +17,7 @@ from drake_dae.arrays import FloatArray, brief, numbers, positive, show, vector
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.files import MESHES, check_file, read_mesh, read_text
-from drake_dae.robots.surfaces.meshes import PosedShape, mesh_of_grid
-from drake_dae.robots.surfaces.surface import Pair, Surface, Vector, tangents
+from drake_dae.robots.surface import Pair, PosedShape, Surface, Vector, mesh_of_grid, tangents
 
 CELLS, BEYOND = 16, 3  # Bells along the longer side, and beyond each edge, for a fit there.
 MOST_LENGTH = 1e9  # The largest height and length in m.

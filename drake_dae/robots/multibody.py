@@ -26,15 +26,8 @@ from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae import Parameter, Signal
 from drake_dae.dae.signals import LARGEST
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.links import (
-    ORIGIN,
-    Application,
-    Kinematics,
-    Links,
-    Reaction,
-    position_index,
-)
-from drake_dae.robots.links.plant_frames import (
+from drake_dae.robots.links import ORIGIN, Application, Kinematics, Links, Reaction, position_index
+from drake_dae.robots.plant_frames import (
     check_joint,
     constant_pose,
     elementary_joints,
@@ -47,7 +40,7 @@ from drake_dae.robots.links.plant_frames import (
     unique_names,
     without_round_off,
 )
-from drake_dae.robots.links.tree import (
+from drake_dae.robots.tree import (
     Inertia,
     LinkMotion,
     frame_jacobian,

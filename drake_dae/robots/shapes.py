@@ -16,8 +16,15 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.meshes import PosedShape, mesh_of_grid
-from drake_dae.robots.surfaces.surface import Surface, Vector, axes_along, normalized, tangents
+from drake_dae.robots.surface import (
+    PosedShape,
+    Surface,
+    Vector,
+    axes_along,
+    mesh_of_grid,
+    normalized,
+    tangents,
+)
 from drake_dae.trace.expressions import check_names, length_of, parse_formula, result_of
 
 _SOLID_LENGTH = 100.0
