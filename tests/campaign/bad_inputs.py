@@ -19,6 +19,7 @@ from campaign.outcomes import RAW, REFUSED, Outcome, checked
 
 from drake_dae import Record, build_scenario, load_scenario, simulate
 from drake_dae.cli import main
+from drake_dae.scenario.form import dump_yaml, load_yaml
 from drake_dae.scenario.robot_file.reading import finalize, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import FOLDER, shipped_scenarios
