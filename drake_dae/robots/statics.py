@@ -11,7 +11,7 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.links import Links
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps
+from drake_dae.trace.numerics import NewtonModel, newton, once, shortest_steps
 
 MOST = 1000
 """The largest product of unknowns and squared equations whose Newton step is traced."""
