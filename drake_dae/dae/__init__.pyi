@@ -26,8 +26,6 @@ from .gains import poles as poles
 from .linearization import Linearization as Linearization
 from .linearization import LinearModel as LinearModel
 from .linearization import linearize as linearize
-from .linearization import linearize_loop as linearize_loop
-from .linearization import sampled_poles as sampled_poles
 from .manifold import Manifold as Manifold
 from .margins import ContactMargin as ContactMargin
 from .margins import RankMargin as RankMargin
