@@ -15,10 +15,11 @@ from drake_dae.arrays import FloatArray, listed, vector
 from drake_dae.dae import DaeSystem, Parameter, Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation import ActuationChain, Stage, chain, diagonal_parameter
-from drake_dae.robots.constraint import Constraint, ConstraintSet, LoopState
-from drake_dae.robots.couplers import plant_constraints
+from drake_dae.robots.constraint import Constraint, ConstraintSet
+from drake_dae.robots.couplings import plant_constraints
 from drake_dae.robots.links import Links
 from drake_dae.robots.loads import Load
+from drake_dae.robots.loops import LoopState
 from drake_dae.robots.multibody import MultibodyExpressions
 from drake_dae.robots.outputs import ForceOutput, PositionOutput, as_force_outputs, force_rows
 from drake_dae.robots.statics import StaticBalance, StaticPlacement
@@ -110,9 +111,8 @@ class RobotModel:
         efforts = links.effort_limits
         if driven.control_signals != tuple(links.actuator_signals):  # u is no joint force.
             efforts = np.full(efforts.size, np.inf)
-        motors = [joint.effort_limit for _, joint in bound.joints if joint.motor is not None]
-        self.control_limits = np.concatenate([efforts, motors])
         self.loop_joints = LoopState(bound, links)
+        self.control_limits = np.concatenate([efforts, self.loop_joints.effort_limits])
         nominal = links.default_positions if nominal_positions is None else nominal_positions
         nominal = vector(f"{name}: nominal_positions", nominal, links.q.numel())
         signals += [signal for force in self.forces for signal in force.signals(bound)]

@@ -174,11 +174,8 @@ class Surface(ABC):
         """The signed distance in m of a point relative to the reference point, shape (3, 1)."""
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
-        """Coordinates along the surface of such a point, shape (2, 1); ModelError without any."""
-        raise ModelError(
-            f"{type(self).__name__} has no coordinates along it; use PointCoordinates or an "
-            "expression"
-        )
+        """Coordinates along the surface of such a point, one row for each signal."""
+        return ca.SX(0, 1)
 
     @property
     def shape(self) -> Mapping[str, float]:
