@@ -10,7 +10,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.signals import DerivativeLayout, Indices
+from drake_dae.dae.signals import DerivativeLayout, Indices, places_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization, nonzeros
@@ -253,7 +253,8 @@ class Manifold:
         states.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
-        chosen = np.array(self.system.states_named(fixed), dtype=np.intp)
+        named = places_of("state", fixed, self.system.state_signals, f"{self.system.name}: ")
+        chosen = np.array(named, dtype=np.intp)
         residual = self.residual(start, p)
         if not residual.any():
             return start
