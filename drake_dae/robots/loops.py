@@ -4,7 +4,7 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, pi
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -18,9 +18,8 @@ from drake_dae.robots.constraint import Constraint, ConstraintSet
 from drake_dae.robots.couplings import rotation_error
 from drake_dae.robots.links import Application, Frames, Kinematics, Links, Reaction
 from drake_dae.robots.plant_frames import without_round_off
-from drake_dae.robots.surface import Vector
+from drake_dae.robots.surface import Letter, Vector
 
-Letter = Literal["x", "y", "z"]
 LETTERS = "xyz"
 
 
