@@ -8,7 +8,7 @@ from drake_dae.dae import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.links import Links
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps
+from drake_dae.trace.numerics import NewtonModel, newton, once, shortest_steps
 
 
 class StaticPlacement:

@@ -18,7 +18,7 @@ from drake_dae.dae import Parameter, Signal, as_expression
 from drake_dae.errors import ModelError
 from drake_dae.trace.expressions import length_of
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
+from drake_dae.trace.numerics import NewtonModel, newton, shortest_steps
 
 _SAG, _MOST, _LEAST = 2.5e-6, 60, 4
 """The wanted distance in m of a facet's edge from the surface; the largest and the least number of
