@@ -49,11 +49,11 @@ from drake_dae.scenario.parts import Poles, ScenarioTask
 from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
-from drake_dae.systems.control.contract import Controller, Derived
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.force_sensor import ForceSensor
-from drake_dae.systems.task.contacts import open_contact
-from drake_dae.systems.task.controller import TaskController
+from drake_dae.systems.controller import Controller, Derived
+from drake_dae.systems.opening_contact import open_contact
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.task_controller import TaskController
 
 
 @checked(lambda text: ScenarioError(("", text)))

@@ -25,9 +25,9 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.model import motion_along
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.sensing.encoders import Encoders
-from drake_dae.systems.task.automaton import SMOOTH, fading
-from drake_dae.systems.task.phases import Approach, Press
+from drake_dae.systems.automaton import SMOOTH, fading
+from drake_dae.systems.phases import Approach, Press
+from drake_dae.systems.sensors import Encoders
 
 PATCH_FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""

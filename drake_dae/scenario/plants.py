@@ -16,12 +16,12 @@ from drake_dae.robots import RobotModel
 from drake_dae.scenario.form import at, expected
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Payload, Robot
-from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.robot_plant import RobotPlant
+from drake_dae.systems.compliant_plant import CompliantPlant
+from drake_dae.systems.contact_forces import DisturbanceForce
+from drake_dae.systems.contact_material import ContactMaterial, PointMaterial
+from drake_dae.systems.contact_plant import ContactPlant
+from drake_dae.systems.ideal_plants import RobotPlant
+from drake_dae.systems.plant import Plant
 
 
 @dataclass(frozen=True, kw_only=True)

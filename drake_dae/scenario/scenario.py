@@ -28,8 +28,8 @@ from drake_dae.scenario import form, parts, plants
 from drake_dae.scenario.form import Family, Key, Reader, keys_of
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
-from drake_dae.systems.control.drives import Sampling
-from drake_dae.systems.task import phases as ps
+from drake_dae.systems import phases as ps
+from drake_dae.systems.applied_control import Sampling
 from drake_dae.trace.compiled import Compiled
 
 
