@@ -50,7 +50,6 @@ from .outputs import ExpressionOutput as ExpressionOutput
 from .outputs import ForceCombination as ForceCombination
 from .outputs import ForceOutput as ForceOutput
 from .outputs import JointPositions as JointPositions
-from .outputs import NamedForce as NamedForce
 from .outputs import PointCoordinates as PointCoordinates
 from .outputs import PositionOutput as PositionOutput
 from .outputs import Squeeze as Squeeze

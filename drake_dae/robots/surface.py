@@ -4,7 +4,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -119,6 +119,7 @@ def _check_whole(grid: FloatArray) -> None:
         raise ModelError("the surface ends within the piece; use a smaller plant.piece")
 
 
+Letter = Literal["x", "y", "z"]
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]
 
