@@ -95,10 +95,6 @@ class PinnedOutputs:
         }
         self.motion = system.trace("pinned motion", motion, inputs)
 
-    def at(self, reference: FloatArray, parameters: FloatArray) -> "PinnedSet":
-        """Returns Z(R) for one R and values of all parameters."""
-        return PinnedSet(self, reference, parameters)
-
     def at_time(
         self, reference: TimeFunction, parameters: TimeFunction, time: float
     ) -> "PinnedSet":
@@ -114,7 +110,7 @@ class PinnedOutputs:
         if not np.all(np.isfinite(goal)):
             text = f"{self.system.name}: the reference is not finite at t = {time:.6g} s"
             raise NonFiniteError(text, time, goal)
-        return self.at(goal, parameters(time))
+        return PinnedSet(self, goal, parameters(time))
 
     @cached_property
     def slope(self) -> TracedFunction:
