@@ -13,8 +13,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import numbers, positive
 from drake_dae.dae import Parameter
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.links import Kinematics, Reaction, position_index
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots.links import Kinematics, Reaction, position_index
+from drake_dae.robots.surface import Vector
 
 
 class Load(ABC):

@@ -24,7 +24,7 @@ from drake_dae.dae import (
     outputs_named,
     with_disturbance,
 )
-from drake_dae.dae.beyond.disturbance import estimated_within
+from drake_dae.dae.disturbance import estimated_within
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
@@ -32,9 +32,13 @@ from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.estimated import estimates_all, with_all_estimated, with_friction_estimated
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.gains import advised
+from drake_dae.scenario.gains import (
+    advised,
+    estimates_all,
+    with_all_estimated,
+    with_friction_estimated,
+)
 from drake_dae.scenario.model import (
     completed_model,
     exogenous_references,
@@ -44,11 +48,11 @@ from drake_dae.scenario.model import (
 from drake_dae.scenario.parts import Poles, ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
-from drake_dae.systems.control.contract import Controller, Derived
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.force_sensor import ForceSensor
-from drake_dae.systems.task.contacts import open_contact
-from drake_dae.systems.task.controller import TaskController
+from drake_dae.systems.controller import Controller, Derived
+from drake_dae.systems.opening_contact import open_contact
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.task_controller import TaskController
 
 
 @checked(lambda text: ScenarioError(("", text)))

@@ -11,10 +11,10 @@ from scipy.linalg import expm
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import SensedContact, SensorNoise, Structure, ZeroDynamics
-from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR, RAMP, Part
-from drake_dae.dae.beyond.one_direction import DirectionGains
+from drake_dae.dae.advised_gains import EVERY, MODEL_ERROR, RAMP, Part
 from drake_dae.dae.law_model import damping_gains
 from drake_dae.dae.margins import ContactMargins
+from drake_dae.dae.one_direction import DirectionGains
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.references import Reference
@@ -25,9 +25,9 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.model import exogenous_references, reference_and_start
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.sensing.encoders import Encoders
-from drake_dae.systems.task.automaton import SMOOTH, fading
-from drake_dae.systems.task.phases import Approach, Press
+from drake_dae.systems.automaton import SMOOTH, fading
+from drake_dae.systems.phases import Approach, Press
+from drake_dae.systems.sensors import Encoders
 
 PATCH_FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""

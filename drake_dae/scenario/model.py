@@ -200,7 +200,8 @@ def _model(
     with at("parameters"):
         model.dae = model.dae.with_values(scenario.parameters)
     with at("bounds"):
-        model.dae = model.dae.with_bounds(scenario.bounds)
+        bounds = {name: (low, high) for name, (low, high) in scenario.bounds.items()}
+        model.dae = model.dae.with_bounds(bounds)
     return model
 
 
