@@ -72,8 +72,8 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     # The folder, and on a terminal somebody who looks.
     folder = options.out or _new_folder(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
     folder.mkdir(parents=True, exist_ok=True)
-    for file in FILES:
-        (folder / file).unlink(missing_ok=True)
+    for name in FILES:
+        (folder / name).unlink(missing_ok=True)
     first_line = f"# Scenario as run by drake-dae {drake_dae.__version__}"
     save_scenario(scenario, folder / SCENARIO, first_line)
     is_watched = meshcat is not None and sys.stdin is not None and sys.stdin.isatty()

@@ -162,8 +162,8 @@ def new_scenario(
     joints = ", ".join(signal.name for signal in links.position_signals)
     where = "; ".join(tried[:_PLACES]) or "surfaces along all axes of the world"
     text = (
-        f"no place was found where the joints of '{tip}' ({joints}) move it along a {surface}. Tried: "
-        f"{where}. Give another tip, as --tip LINK:x,y,z, or copy a shipped scenario"
+        f"no place was found where the joints of '{tip}' ({joints}) move it along a {surface}. "
+        f"Tried: {where}. Give another tip, as --tip LINK:x,y,z, or copy a shipped scenario"
     )
     raise ScenarioError(("robot.file", text))
 
