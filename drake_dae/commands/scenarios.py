@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import number_in
@@ -19,6 +20,7 @@ from drake_dae.errors import (
     DrakeDaeError,
     GeometryWarning,
     ModelError,
+    RobotFileWarning,
     ScenarioError,
     SimulationError,
 )
@@ -28,6 +30,7 @@ from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_completed, build_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
 from drake_dae.scenario.new import new_scenario
+from drake_dae.scenario.robot_file.reading import robot_links
 from drake_dae.scenario.scenario import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
@@ -67,8 +70,11 @@ def new_command(options: argparse.Namespace) -> int:
         out.write_text(text, encoding="utf-8")
         print(f"written: {out}", flush=True)
         tell("checking it by a run")
+        warnings.simplefilter("ignore", RobotFileWarning)  # It has been told.
         try:
-            completed, loop = build_completed(load_scenario(out))
+            scenario = load_scenario(out)
+            robot = robot_links(scenario.robot, SceneGraph(), drawn=False)
+            completed, loop = build_completed(scenario, robot=robot)
             scenario, context = completed.scenario, start_scenario(completed.scenario, loop)
             # The first round: the second repeats it.
             half = replace(scenario, duration=scenario.duration / 2)

@@ -46,6 +46,7 @@ from drake_dae.scenario.model import (
     scenario_structure,
 )
 from drake_dae.scenario.parts import Poles, ScenarioTask
+from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
 from drake_dae.systems.controller import Controller, Derived
@@ -74,13 +75,19 @@ def build_scenario(
 
 @uncollected
 def build_completed(
-    scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
+    scenario: Scenario,
+    meshcat: Meshcat | None = None,
+    commanded: bool = False,
+    robot: RobotLinks | None = None,
 ) -> tuple[Completed, ClosedLoop]:
-    """The completed scenario and its loop; a person may change the references if `commanded`."""
+    """The completed scenario and its loop; a person may change the references if `commanded`.
+
+    A `robot` that is read already is not drawn.
+    """
     # The robot, with the outputs and the start that the scenario leaves out.
     check_task(scenario)
     drawn = {"scene_graph": (scene_graph := SceneGraph()), "meshcat": meshcat}
-    completed, model, structure = completed_model(scenario, scene_graph)
+    completed, model, structure = completed_model(scenario, scene_graph, robot=robot)
     if not model.dae.num_controls:
         return completed, _mechanism(completed.scenario, model, **drawn)
     if structure is None:
