@@ -24,7 +24,7 @@ from drake_dae.dae import (
     TrackingLaw,
     find_constraint_structure,
     find_structure,
-    outputs_named,
+    places_of,
     with_disturbance,
 )
 from drake_dae.dae.disturbance import estimated_within
@@ -205,7 +205,7 @@ def build_completed(
         with at("sensors.encoders"):
             make_sensor(plant, settings.encoders, period)
     with at("judgement.tolerances"):
-        outputs_named(scenario.judgement.tolerances, model.dae.output_signals)
+        places_of("output", scenario.judgement.tolerances, model.dae.output_signals)
 
     # The controller and the loop: with a task the law in contact, and one with the contact open.
     if task is not None:
