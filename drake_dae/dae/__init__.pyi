@@ -10,10 +10,10 @@ from .contact_gains import contact_damping as contact_damping
 from .contact_gains import contact_gains as contact_gains
 from .contacts import UnilateralInput as UnilateralInput
 from .derivatives import Derivatives as Derivatives
+from .derivatives import Elimination as Elimination
 from .disturbance import IdentifiedTerms as IdentifiedTerms
 from .disturbance import Observation as Observation
 from .disturbance import with_disturbance as with_disturbance
-from .elimination import Elimination as Elimination
 from .extension import Extension as Extension
 from .extension import dynamic_extension as dynamic_extension
 from .fields import as_expression as as_expression

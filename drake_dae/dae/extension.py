@@ -30,7 +30,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.numerics import positive
 
 
 @checked(ModelError)

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import numbers, positive, unknown_name
-from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import eliminate
+from drake_dae.dae.derivatives import Derivatives, eliminate
 from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
 from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.structure import Structure

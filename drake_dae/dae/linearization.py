@@ -14,7 +14,7 @@ from drake_dae.dae.signals import Indices, Signal
 from drake_dae.dae.structure import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.round_off import equilibration
+from drake_dae.trace.numerics import equilibration
 
 ComplexArray = np.typing.NDArray[np.complex128]
 

@@ -15,16 +15,18 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization, nonzeros
 from drake_dae.trace.functions import TracedFunction, count_operations
-from drake_dae.trace.newton import (
+from drake_dae.trace.numerics import (
     PRECISION,
     ROUNDING,
     NewtonModel,
+    are_dependent,
     newton,
     norm,
+    positive,
     shortest_steps,
     steps_along,
+    unit_rows,
 )
-from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
 POLE = 1e-3  # A larger residual, over its usual change by the scale of the states, is no round-off.
 NEAR_POLE = 1e-6, 1e-3  # The distances at which poles show, in states over their scale.

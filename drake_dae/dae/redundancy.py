@@ -16,8 +16,8 @@ from drake_dae.dae.samples import Samples, draw
 from drake_dae.dae.system import DaeSystem, ForceSharing
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
-from drake_dae.trace.newton import ROUND_OFF
-from drake_dae.trace.round_off import (
+from drake_dae.trace.numerics import (
+    ROUND_OFF,
     equilibrated,
     positive,
     rank_of,

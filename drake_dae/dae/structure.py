@@ -20,8 +20,7 @@ from drake_dae.dae.assumptions import (
     find_dependence,
     redundant_constraints,
 )
-from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import Elimination, eliminate
+from drake_dae.dae.derivatives import Derivatives, Elimination, eliminate
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.margins import RankMargin, find_margin
 from drake_dae.dae.redundancy import all_constraints_hold
@@ -32,7 +31,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.factorization import Factorization, nearest_solution
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibrated, equilibration, positive, smallest_singular_value
+from drake_dae.trace.numerics import equilibrated, equilibration, positive, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 

@@ -19,7 +19,7 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import SINGULAR
+from drake_dae.trace.numerics import SINGULAR
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae import Parameter, Signal
+from drake_dae.dae import Parameter, Signal, as_expression, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.links import Links
 
@@ -71,33 +71,15 @@ class ActuationChain:
     drift: ca.SX
     drive: ca.SX  # Shape (k, p).
     control_signals: tuple[Signal, ...]
-
-    @property
-    def state(self) -> ca.SX:
-        """The states of all stages, shape (k, 1)."""
-        return ca.vertcat(ca.SX(0, 1), *[stage.state for stage in self.stages])
-
-    @property
-    def state_signals(self) -> tuple[Signal, ...]:
-        return tuple(signal for stage in self.stages for signal in stage.state_signals)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(parameter for stage in self.stages for parameter in stage.parameters)
-
-    @property
-    def carries_rotors(self) -> bool:
-        """Whether the rotors move with a stage instead of the links."""
-        return any(stage.carries_rotors for stage in self.stages)
+    state: ca.SX  # Of all stages, shape (k, 1).
 
 
 def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
     """Wires stages from the joints toward the motor: each drives the one before it."""
-    p = len(links.actuator_signals)
+    p, none = len(links.actuator_signals), ca.SX(0, 1)
     if not stages:  # Rigid joints: the control is the joint force.
-        none = ca.SX(0, 1), ca.SX(0, p)
-        rigid = ca.SX(p, 1), ca.SX.eye(p), ca.SX(0, 0), *none
-        return ActuationChain((), *rigid, tuple(links.actuator_signals))
+        rigid = ca.SX(p, 1), ca.SX.eye(p), ca.SX(0, 0), none, ca.SX(0, p)
+        return ActuationChain((), *rigid, tuple(links.actuator_signals), none)
     names = [type(stage).__name__ for stage in stages]
     if not p:
         raise ModelError(f"{names[0]} needs actuators of the links, and there are none")
@@ -108,8 +90,7 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
             "actuation matrix"
         )
     transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
-    rates = ca.mtimes(transposed, links.velocity_map)
-    if not ca.is_equal(ca.sparsify(rates), transposed, 9):
+    if not ca.is_equal(ca.sparsify(ca.mtimes(transposed, links.velocity_map)), transposed, 9):
         raise ModelError(
             "actuation stages need the actuated velocities to be derivatives of positions, "
             "q_i' = v_i: choose such coordinates where N(q) is not the identity"
@@ -139,16 +120,15 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
         drift=ca.vertcat(*drifts),
         drive=ca.vertcat(ca.SX(idle, p), attached[-1].drive_matrix),
         control_signals=attached[-1].drive_signals,
+        state=ca.vertcat(*[stage.state for stage in attached]),
     )
 
 
 def full_matrix(name: str, value: ArrayLike, size: int) -> FloatArray:
     """A finite number, a diagonal or a matrix, as a matrix of shape (size, size)."""
     array = numbers(name, value)
-    if array.ndim == 0:
-        array = np.full(size, float(array))
-    if array.ndim == 1:
-        array = np.diag(array)
+    if array.ndim < 2 and array.shape in ((), (size,)):
+        array = np.diag(np.broadcast_to(array, (size,)))
     if array.shape != (size, size) or not np.all(np.isfinite(array)):
         raise ModelError(
             f"{name} must be a finite number, shape ({size},) or ({size}, {size}), got {value!r}"
@@ -166,11 +146,10 @@ def diagonal_parameter(
 ) -> tuple[Parameter, ca.SX]:
     """A parameter of one number per actuator, and its symbol, shape (size, 1)."""
     array = numbers(name, value)
-    if array.ndim == 0:
-        array = np.full(size, float(array))
-    if array.shape != (size,) or not np.all(np.isfinite(array)):
+    if array.shape not in ((), (size,)) or not np.all(np.isfinite(array)):
         raise ModelError(f"{name} must be a finite number or shape ({size},), got {value!r}")
-    parameter = Parameter(name, array, unit, positive, nonnegative=nonnegative)
+    values = np.broadcast_to(array, (size,)).copy()
+    parameter = Parameter(name, values, unit, positive, nonnegative=nonnegative)
     return parameter, parameter.symbol
 
 
@@ -232,25 +211,23 @@ class FlexibleJoints(Stage):
 
     def attach(self, links: Links) -> AttachedStage:
         names = [signal.name for signal in links.actuator_signals]
-        p = len(names)
-        inertia = self.inertia
+        p, inertia = len(names), self.inertia
         if inertia is None:
             inertia = links.reflected_inertia
-            bare = [n for n, i in zip(names, links.reflected_inertia, strict=True) if i <= 0]
+            bare = [name for name, i in zip(names, inertia, strict=True) if i <= 0]
             if bare:
                 raise ModelError(
                     f"FlexibleJoints: no rotor inertia is declared for {', '.join(bare)}; give "
                     "'inertia', or drake:rotor_inertia and drake:gear_ratio in the URDF"
                 )
         rotary = all(signal.unit == "N m" for signal in links.actuator_signals)
-        units = ("N m/rad", "kg m^2", "N m s/rad") if rotary else ("", "", "")
+        units = ("N m/rad", "kg m^2", "N m s/rad", "N m") if rotary else ("", "", "", "")
         stiffness, k = matrix_parameter("flexible_joints.stiffness", self.stiffness, p, units[0])
         rotors, m_2 = matrix_parameter("flexible_joints.inertia", inertia, p, units[1])
-        parameters = [stiffness, rotors]
-        d = ca.SX(p, p)
-        if np.any(full_matrix("flexible_joints.damping", self.damping, p)):
+        parameters, d, name = [stiffness, rotors], ca.SX(p, p), "flexible_joints.damping"
+        if np.any(full_matrix(name, self.damping, p)):
             try:
-                damping, d = matrix_parameter("flexible_joints.damping", self.damping, p, units[2])
+                damping, d = matrix_parameter(name, self.damping, p, units[2])
             except ModelError as error:
                 raise ModelError(
                     f"{error}. Damp all flexible joints or none: where only some are damped, the "
@@ -260,28 +237,26 @@ class FlexibleJoints(Stage):
         q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
         drag = ca.SX(p, 1)
         if self.friction is not None:
-            unit = "N m" if rotary else ""
-            name = "flexible_joints.friction"
-            coefficients, F_c = diagonal_parameter(name, self.friction, p, unit, nonnegative=True)
-            slow = np.array([self.stiction_tolerance])
+            name, slow = "flexible_joints.friction", np.array([self.stiction_tolerance])
+            dry, F_c = diagonal_parameter(name, self.friction, p, units[3], nonnegative=True)
             creep = Parameter("flexible_joints.stiction_tolerance", slow, positive=True)
-            parameters += [coefficients, creep]
+            parameters += [dry, creep]
             drag = F_c * rate / ca.sqrt(rate**2 + creep.symbol**2)
 
         def force(position: ca.SX, velocity: ca.SX) -> ca.SX:
             return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)  # (64)
 
-        units_of = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
-        kinds = list(zip(names, units_of, strict=True))
-        positions = [Signal(f"{name}.position", unit) for name, unit in kinds]
-        rates = [Signal(f"{name}.velocity", f"{unit}/s") for name, unit in kinds]
+        def drift(position: ca.SX, velocity: ca.SX) -> ca.SX:
+            return ca.vertcat(rate, -force(position, velocity) - drag)  # (65)
+
+        lengths = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
+        positions = [Signal(f"{n}.position", m) for n, m in zip(names, lengths, strict=True)]
+        rates = [Signal(f"{n}.velocity", f"{m}/s") for n, m in zip(names, lengths, strict=True)]
         return AttachedStage(
             state=ca.vertcat(q_2, rate),
             state_signals=(*positions, *rates),
             mass=ca.diagcat(ca.SX.eye(p), m_2),
-            drift=lambda position, velocity: ca.vertcat(  # (65)
-                rate, -force(position, velocity) - drag
-            ),
+            drift=drift,
             drive_matrix=ca.vertcat(ca.SX(p, p), ca.SX.eye(p)),
             drive_signals=tuple(links.actuator_signals),
             force=force,
@@ -317,30 +292,27 @@ class DcMotors(Stage):
 
     def attach(self, links: Links) -> AttachedStage:
         names = [signal.name for signal in links.actuator_signals]
-        p = len(names)
+        p, kind = len(names), "dc_motors"
         ratio = links.gear_ratios if self.gear_ratio is None else self.gear_ratio
         constant, k_m = diagonal_parameter(
-            "dc_motors.torque_constant", self.torque_constant, p, "N m/A"
+            f"{kind}.torque_constant", self.torque_constant, p, "N m/A"
         )
-        inductance, l = diagonal_parameter("dc_motors.inductance", self.inductance, p, "H", True)  # noqa: E741
-        resistance, r = diagonal_parameter("dc_motors.resistance", self.resistance, p, "ohm")
-        gears, n = diagonal_parameter("dc_motors.gear_ratio", ratio, p, "")
-        for parameter, wrong, rule in (
-            (constant, constant.value == 0, "not be zero"),
-            (gears, gears.value == 0, "not be zero"),
-            (resistance, resistance.value < 0, "not be negative"),
-        ):
-            if wrong.any():
-                raise ModelError(f"{parameter.name} must {rule}, got {parameter.value}")
+        inductance, L = diagonal_parameter(f"{kind}.inductance", self.inductance, p, "H", True)
+        resistance, R = diagonal_parameter(f"{kind}.resistance", self.resistance, p, "ohm")
+        gears, n = diagonal_parameter(f"{kind}.gear_ratio", ratio, p, "")
+        if (resistance.value < 0).any():
+            raise ModelError(f"{kind}.resistance must not be negative, got {resistance.value}")
+        for parameter in (constant, gears):
+            if (parameter.value == 0).any():
+                raise ModelError(f"{parameter.name} must not be zero, got {parameter.value}")
         current = ca.SX.sym("I", p)
-
         return AttachedStage(
             state=current,
-            state_signals=tuple(Signal(f"{name}.current", "A") for name in names),
-            mass=ca.diag(l),
-            drift=lambda position, velocity: -r * current - k_m * n * velocity,  # (75)
+            state_signals=signals([f"{name}.current" for name in names], "A"),
+            mass=ca.diag(L),
+            drift=lambda position, velocity: -R * current - k_m * n * velocity,  # (75)
             drive_matrix=ca.SX.eye(p),
-            drive_signals=tuple(Signal(f"{name}.voltage", "V") for name in names),
+            drive_signals=signals([f"{name}.voltage" for name in names], "V"),
             force=lambda position, velocity: n * k_m * current,  # (74)
             ports={"motor_current": slice(0, p)},
             parameters=(constant, inductance, resistance, gears),
@@ -374,34 +346,26 @@ class ElectrohydraulicServos(Stage):
         names = [signal.name for signal in links.actuator_signals]
         p = len(names)
         fluid, k_h = diagonal_parameter("hydraulics.stiffness", self.stiffness, p, "N/m", True)
-        leakage, g_p = matrix_parameter(
-            "hydraulics.leakage", self.leakage, p, "m/(N s)", definite=False
-        )
+        leakage, g_p = matrix_parameter("hydraulics.leakage", self.leakage, p, "m/(N s)", False)
         pressing = ca.SX.sym("fa", p)
 
         def geometry(position: ca.SX) -> ca.SX:
             if not callable(self.geometry):
                 return ca.SX(full_matrix("hydraulics.geometry", self.geometry, p))
-            try:
-                value = ca.SX(self.geometry(position))
-            except (NotImplementedError, TypeError) as error:
-                raise ModelError(
-                    f"hydraulics.geometry must return a CasADi matrix, for example "
-                    f"casadi.diag(...): {error}"
-                ) from error
+            value = as_expression("hydraulics", "geometry", self.geometry(position))
             if value.shape != (p, p):
                 raise ModelError(f"hydraulics.geometry has shape {value.shape}, expected {(p, p)}")
             return value
 
         return AttachedStage(
             state=pressing,
-            state_signals=tuple(Signal(f"{name}.actuator_force", "N") for name in names),
+            state_signals=signals([f"{name}.actuator_force" for name in names], "N"),
             mass=ca.diag(1 / k_h),
             drift=lambda position, velocity: (
                 -ca.mtimes(g_p, pressing) - ca.mtimes(geometry(position).T, velocity)
             ),
             drive_matrix=ca.SX.eye(p),
-            drive_signals=tuple(Signal(f"{name}.valve_current") for name in names),
+            drive_signals=signals([f"{name}.valve_current" for name in names]),
             force=lambda position, velocity: ca.mtimes(geometry(position), pressing),
             ports={"actuator_force": slice(0, p)},
             parameters=(fluid, leakage),

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import ClassVar, Self
 
 import casadi as ca
-import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_dae.arrays import FloatArray, unknown_name
@@ -30,18 +29,6 @@ class Touch:
     is_exact: bool = True  # Whether the distance is exact also off the object.
 
 
-@dataclass(frozen=True, eq=False)
-class Joint:
-    """The spring, damper, limits and motor of a joint along its coordinate c; inf for no limit."""
-
-    force: Callable[[ca.SX, ca.SX], ca.SX]  # (c, c') -> that of spring and damper, toward larger c.
-    lower: float  # Limits of c.
-    upper: float
-    velocity_limit: float  # The largest |c'|.
-    motor: Signal | None  # The control that adds to the force, if it has one.
-    effort_limit: float  # The largest control.
-
-
 class Constraint(ABC):
     """m constraint equations of a robot, and the m constraint forces lambda that enforce them.
 
@@ -59,8 +46,7 @@ class Constraint(ABC):
     5. `applications` are all these forces, each on one frame and the opposite on another; none if
        the frames are not known. Pictures show the first. If the constraint holds and does not move,
        their power is zero where `is_ideal`, and not positive otherwise.
-    6. `coordinates` are free coordinates along it, one row for each of `coordinate_signals`, if
-       any. A `joint` is that of a closed loop: its power is force times the rate of its coordinate.
+    6. `coordinates` are free coordinates along it, one row for each of `coordinate_signals`.
     7. With friction, `friction_parameter` names the coefficient, and `sliding` is the velocity
        relative to the other object.
     8. `touch` is the contact point, if there is a free side; `residual` is its clearance.
@@ -142,15 +128,13 @@ class Constraint(ABC):
         return ()
 
     def coordinates(self, frames: Frames) -> ca.SX:
-        """The free coordinates along the constraint, shape (k, 1); ModelError without any."""
-        raise ModelError(
-            f"'{self.name}' has no coordinates along it; use PointCoordinates or an expression"
-        )
+        """The free coordinates along the constraint, shape (k, 1)."""
+        return ca.SX(0, 1)
 
     @property
-    def joint(self) -> Joint | None:
-        """The joint along its coordinate; None if it is not a joint."""
-        return None
+    def motors(self) -> tuple[Signal, ...]:
+        """Names and units of the controls that act at it: the effort of a motor in its joint."""
+        return ()
 
     @property
     def friction_parameter(self) -> str | None:
@@ -312,15 +296,8 @@ class ConstraintSet:
         return kinematics.value(ca.vertcat(*rows)), signals
 
     @property
-    def joints(self) -> tuple[tuple[Constraint, Joint], ...]:
-        """The joints that close loops, with their properties along the coordinate."""
-        pairs = ((constraint, constraint.joint) for constraint in self.constraints)
-        return tuple((constraint, joint) for constraint, joint in pairs if joint is not None)
-
-    @property
     def motors(self) -> tuple[Signal, ...]:
-        """Names and units of the motors' efforts in the loop-closing joints."""
-        return tuple(joint.motor for _, joint in self.joints if joint.motor is not None)
+        return tuple(s for c in self.constraints for s in c.motors)
 
     def contacts(self, links: Links) -> tuple[UnilateralInput, ...]:
         """The unilateral constraint forces, if friction acts on one of them."""
@@ -336,34 +313,3 @@ class ConstraintSet:
                 if pushes
             ]
         return tuple(contacts) if any(contact.friction for contact in contacts) else ()
-
-
-class LoopState:
-    """The l joints of a robot that close loops: (c, c') as `state`, with `signals` and `limits`.
-
-    `force` is the generalized force of their springs and dampers, shape (nv, 1), `columns` and
-    `motors` are those of unit efforts in all joints and in those with motors, shape (nv, k).
-    """
-
-    def __init__(self, constraints: ConstraintSet, links: Links) -> None:
-        members, kinematics = constraints.joints, links.kinematics()
-        joints = [joint for _, joint in members]
-        coordinates = [c.coordinates(kinematics) for c, _ in members]
-        rates = [kinematics.derivative(c) for c in coordinates]
-        position = kinematics.value(ca.vertcat(ca.SX(0, 1), *coordinates))
-        rate = kinematics.value(ca.vertcat(ca.SX(0, 1), *rates))
-        self.state = ca.vertcat(position, rate)
-        named = [signal for c, _ in members for signal in c.coordinate_signals]
-        self.signals = (*named, *(signal.derivative(1) for signal in named))
-        fastest = [joint.velocity_limit for joint in joints]
-        low = [*(joint.lower for joint in joints), *(-v for v in fastest)]
-        high = [*(joint.upper for joint in joints), *fastest]
-        self.limits: tuple[FloatArray, FloatArray] = (np.array(low), np.array(high))
-        unit, total = ca.SX.sym("unit", len(joints)), Reaction(ca.SX(links.v.numel(), 1))
-        for i, own in enumerate(rates):
-            total += kinematics.reaction(unit[i] * own)
-        columns = total.map(lambda part: ca.jacobian(part, unit))
-        self.columns = links.generalized_force(kinematics, columns)
-        forces = [joint.force(position[i], rate[i]) for i, joint in enumerate(joints)]
-        self.force = ca.sparsify(ca.mtimes(self.columns, ca.vertcat(ca.SX(0, 1), *forces)))
-        self.motors = self.columns[:, [i for i, j in enumerate(joints) if j.motor is not None]]

@@ -4,7 +4,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -18,7 +18,7 @@ from drake_dae.dae import Parameter, Signal, as_expression
 from drake_dae.errors import ModelError
 from drake_dae.trace.expressions import length_of
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
+from drake_dae.trace.numerics import NewtonModel, newton, shortest_steps
 
 _SAG, _MOST, _LEAST = 2.5e-6, 60, 4
 """The wanted distance in m of a facet's edge from the surface; the largest and the least number of
@@ -119,6 +119,7 @@ def _check_whole(grid: FloatArray) -> None:
         raise ModelError("the surface ends within the piece; use a smaller plant.piece")
 
 
+Letter = Literal["x", "y", "z"]
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]
 
@@ -174,11 +175,8 @@ class Surface(ABC):
         """The signed distance in m of a point relative to the reference point, shape (3, 1)."""
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
-        """Coordinates along the surface of such a point, shape (2, 1); ModelError without any."""
-        raise ModelError(
-            f"{type(self).__name__} has no coordinates along it; use PointCoordinates or an "
-            "expression"
-        )
+        """Coordinates along the surface of such a point, one row for each signal."""
+        return ca.SX(0, 1)
 
     @property
     def shape(self) -> Mapping[str, float]:

@@ -10,7 +10,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae import Observation
-from drake_dae.dae.friction_share import Metric, shares
+from drake_dae.dae.disturbance import Metric, shares
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
