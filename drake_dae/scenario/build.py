@@ -25,9 +25,8 @@ from drake_dae.dae import (
     with_disturbance,
 )
 from drake_dae.dae.disturbance import estimated_within
-from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
-from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
+from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop, wire_loop
+from drake_dae.diagrams.parts import LoopSettings, hold_sampling, make_sensor
 from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, ScaledForce
@@ -167,7 +166,7 @@ def build_completed(
     period = settings.period(plant.time_step)
     if settings.sampling is not None:
         with at("sampling"):
-            hold_before(plant, settings.sampling)
+            hold_sampling(plant, settings.sampling)
     if settings.encoders is not None:
         with at("sensors.encoders"):
             make_sensor(plant, settings.encoders, period)
