@@ -40,7 +40,7 @@ from .signals import DerivativeLayout as DerivativeLayout
 from .signals import Indices as Indices
 from .signals import Parameter as Parameter
 from .signals import Signal as Signal
-from .signals import outputs_named as outputs_named
+from .signals import places_of as places_of
 from .signals import signals as signals
 from .stability import ComplexArray as ComplexArray
 from .stability import Stability as Stability

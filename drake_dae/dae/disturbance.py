@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.signals import DerivativeLayout, Parameter, Signal
+from drake_dae.dae.signals import DerivativeLayout, Parameter, Signal, places_of
 from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
@@ -35,7 +35,7 @@ def with_disturbance(
     `frictions` are the names of parameters that are observed as well: coefficients of friction,
     such as "wall.friction", and others with bounds or `ranges` of `Observing`.
     """
-    rows = system.states_named(states)
+    rows = places_of("state", states, system.state_signals, f"{system.name}: ")
     if not rows or len(set(rows)) != len(rows):
         raise ModelError(
             f"{system.name}: with_disturbance needs names of states, each once, got "

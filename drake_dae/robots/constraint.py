@@ -114,9 +114,9 @@ class Constraint(ABC):
         """The reaction on the robot of the constraint forces, shape (m, 1)."""
         return kinematics.reaction(ca.dot(constraint_force, self.rate(kinematics)))
 
-    def drag(self, kinematics: Kinematics) -> Reaction | None:
-        """The forces on the robot independent of constraint forces; None if there are none."""
-        return None
+    def drag(self, kinematics: Kinematics) -> Reaction:
+        """The forces on the robot independent of constraint forces."""
+        return Reaction(ca.SX(kinematics.v.numel(), 1))
 
     @abstractmethod
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
@@ -158,29 +158,16 @@ class Constraint(ABC):
         return RigidTransform()
 
 
-@dataclass(frozen=True)
 class ConstraintSet:
-    """The constraints of a robot, stacked in the order of their constraint forces."""
+    """The constraints of a robot, stacked in the order of their `size` constraint forces."""
 
-    constraints: Sequence[Constraint]
-
-    @property
-    def size(self) -> int:
-        """m, the number of constraint forces."""
-        return len(self.force_signals)
-
-    @cached_property
-    def force_signals(self) -> tuple[Signal, ...]:
-        """Names and units of lambda."""
-        return tuple(s for c in self.constraints for s in c.force_signals)
-
-    @property
-    def residual_signals(self) -> tuple[Signal, ...]:
-        return tuple(s for c in self.constraints for s in c.residual_signals)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(p for c in self.constraints for p in c.parameters)
+    def __init__(self, constraints: Sequence[Constraint]) -> None:
+        self.constraints = constraints
+        self.parameters = tuple(p for c in constraints for p in c.parameters)
+        self.force_signals = tuple(s for c in constraints for s in c.force_signals)
+        self.residual_signals = tuple(s for c in constraints for s in c.residual_signals)
+        self.motors = tuple(s for c in constraints for s in c.motors)
+        self.size = len(self.force_signals)
 
     def place(self, name: str) -> int:
         """The index of a constraint force in lambda; ModelError if there is none."""
@@ -239,9 +226,7 @@ class ConstraintSet:
         """The generalized force of constraints independent of lambda, shape (nv, 1)."""
         total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
         for constraint in self.constraints:
-            reaction = constraint.drag(kinematics)
-            if reaction is not None:
-                total += links.generalized_force(kinematics, reaction)
+            total += links.generalized_force(kinematics, constraint.drag(kinematics))
         return total
 
     def acting(self, kinematics: Kinematics) -> list[tuple[Constraint, slice, Application]]:
@@ -275,10 +260,7 @@ class ConstraintSet:
     def wrenches(
         self, kinematics: Kinematics, constraint_force: ca.SX
     ) -> tuple[ca.SX, tuple[Signal, ...]]:
-        """The moment and force of each constraint on each of its frames, as Drake's SpatialForce.
-
-        In the world, the force at the frame's origin, with signals "<constraint>.<frame>.mx", ...
-        """
+        """Moment and force of each constraint on each of its frames, at its origin in the world."""
         rows, names = [ca.SX(0, 1)], []
         for constraint, part in self.parts():
             by_frame: dict[str, ca.SX] = {}
@@ -295,21 +277,13 @@ class ConstraintSet:
         signals = tuple(Signal(f"{name}.{part}", unit) for name in names for part, unit in parts)
         return kinematics.value(ca.vertcat(*rows)), signals
 
-    @property
-    def motors(self) -> tuple[Signal, ...]:
-        return tuple(s for c in self.constraints for s in c.motors)
-
     def contacts(self, links: Links) -> tuple[UnilateralInput, ...]:
         """The unilateral constraint forces, if friction acts on one of them."""
         kinematics, contacts = links.kinematics(), []
         for constraint in self.constraints:
             sliding = constraint.sliding(kinematics)
             sliding = None if sliding is None else kinematics.value(sliding)
-            contacts += [
-                UnilateralInput(signal.name, constraint.friction_parameter, sliding)
-                for signal, pushes in zip(
-                    constraint.force_signals, constraint.is_unilateral, strict=True
-                )
-                if pushes
-            ]
+            pairs = zip(constraint.force_signals, constraint.is_unilateral, strict=True)
+            names = [signal.name for signal, pushes in pairs if pushes]
+            contacts += [UnilateralInput(n, constraint.friction_parameter, sliding) for n in names]
         return tuple(contacts) if any(contact.friction for contact in contacts) else ()

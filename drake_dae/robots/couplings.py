@@ -267,14 +267,10 @@ class JointCoupler(Constraint):
 
 
 def plant_constraints(links: Links) -> tuple[Constraint, ...]:
-    """The constraints of the plant of the links; none without a plant.
+    """The constraints of the plant of the links, which Drake enforces only in discrete plants.
 
-    Couplers, which mimic joints are, become a `JointCoupler` "<follower>_coupler", and rods of
-    AddDistanceConstraint a `FixedDistance` "rod0", "rod1", ... Drake enforces them only in discrete
-    plants; here they hold in continuous time as well.
-
-    Raises:
-        ModelError: The plant has other constraints, or a rod with a stiffness.
+    Couplers and mimic joints are a `JointCoupler` "<follower>_coupler", rods a `FixedDistance`
+    "rod0", "rod1", ...; others raise ModelError.
     """
     plant = links.plant
     if plant is None or plant.num_constraints() == 0:
@@ -291,11 +287,7 @@ def plant_constraints(links: Links) -> tuple[Constraint, ...]:
 
 
 def couplings_of(plant: MultibodyPlant) -> list[JointCoupler]:
-    """The couplers of a finalized plant, read from a mathematical program of Drake.
-
-    Raises:
-        ModelError: The plant has a constraint that Drake does not describe.
-    """
+    """The couplers of a finalized plant, read from a mathematical program of Drake."""
     program = MathematicalProgram()
     q = program.NewContinuousVariables(plant.num_positions(), "q")
     try:

@@ -25,10 +25,7 @@ class Wrenches:
 
 
 class ConstraintWrenches:
-    """The points, forces and moments of the constraints of a robot that act at a point.
-
-    `frames` are those that they act on; `with_moment` says which have a moment besides the force.
-    """
+    """The wrenches of the `constraints` that act at a point, on `frames`; some `with_moment`."""
 
     def __init__(self, model: RobotModel, parameters: ArrayLike | None = None) -> None:
         links, bound = model.links, ConstraintSet(model.constraints)
@@ -67,10 +64,7 @@ def own_values(constraint: Constraint, dae: DaeSystem, parameters: FloatArray) -
 
 
 def contact_normals(model: RobotModel) -> TracedFunction:
-    """(x, parameters) -> the normal of each constraint of one force, toward the robot, (3 m, 1).
-
-    It is the force on the robot per unit of constraint force without sliding, so without friction.
-    """
+    """(x, parameters) -> the force of each constraint at rest per unit of its lambda, (3 m, 1)."""
     kinematics, v = model.links.kinematics(), model.links.v
     axes = [a.force_axes for _, _, a in ConstraintSet(model.constraints).acting(kinematics)]
     normals = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), v, 0 * v)

@@ -49,7 +49,7 @@ class Application:
     Frame A exerts F and M on frame B at the point; B exerts the opposite on A at the same point.
     """
 
-    point: ca.SX  # Where F acts, m, shape (3, 1).
+    point: ca.SX  # m, shape (3, 1).
     force_axes: ca.SX  # N for a unit of each lambda, shape (3, m).
     moment_axes: ca.SX  # N m for a unit of each lambda, shape (3, m).
     frame_b: str
@@ -182,9 +182,10 @@ class Links(Frames):
     plant: MultibodyPlant | None = None  # Their MultibodyPlant, for Drake's visualization.
     outlines: tuple[Outline, ...]  # Of the collision geometry of each link, or its origin.
 
-    @abstractmethod
     def landmarks(self) -> ca.SX:
-        """Points of the robot for views, in m, shape (3, k); the first is the world's origin."""
+        """The origins of the frames of `outlines` in m, shape (3, k), the world's first."""
+        frames = dict.fromkeys(outline.frame for outline in self.outlines)
+        return ca.horzcat(*[self.position(frame) for frame in frames])
 
     @abstractmethod
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
@@ -254,7 +255,9 @@ class LinkExpressions(Links):
         for name, symbol in (("q", q), ("v", v)):
             if not is_symbol(symbol):
                 raise ModelError(f"{name} must be a CasADi SX column of symbols")
-        self.q, self.v, self.frames, self.parameters = q, v, dict(frames or {}), parameters
+        self.q, self.v, self.parameters = q, v, parameters
+        world = {"world": (ca.SX.eye(3), ca.SX(3, 1))}
+        self.frames = world | dict(frames or {}) | world
         nq, nv = q.numel(), v.numel()
 
         def fitting(name: str, given: Any, shape: tuple[int, ...]) -> Any:
@@ -269,9 +272,8 @@ class LinkExpressions(Links):
         self.mass_matrix = matrix("mass_matrix", mass_matrix, (nv, nv))
         self.bias = matrix("bias", bias, (nv, 1))
         self.velocity_map = matrix("velocity_map", velocity_map, (nq, nv))
-        B = numbers(
-            "actuation_matrix", np.eye(nv) if actuation_matrix is None else actuation_matrix
-        )
+        given = np.eye(nv) if actuation_matrix is None else actuation_matrix
+        B = numbers("actuation_matrix", given)
         if B.ndim != 2 or B.shape[0] != nv:
             raise ModelError(f"actuation_matrix has shape {B.shape}, expected ({nv}, nu)")
         self.actuation_matrix, nu = B, B.shape[1]
@@ -299,45 +301,36 @@ class LinkExpressions(Links):
 
         self.position_limits = limits("position_limits", position_limits, nq)
         self.velocity_limits = limits("velocity_limits", velocity_limits, nv)
-        self.outlines = tuple(Outline(name, name) for name in ("world", *self.frames))
+        self.outlines = tuple(Outline(name, name) for name in self.frames)
+
+    def _pose(self, frame: str) -> ca.SX | tuple[ca.SX, ca.SX]:
+        if frame not in self.frames:
+            raise ModelError(unknown_name("frame", frame, self.frames))
+        return self.frames[frame]
 
     def rotation(self, frame: str) -> ca.SX:
-        if frame == "world":
-            return ca.SX.eye(3)
         pose = self._pose(frame)
         if not isinstance(pose, tuple):
             raise ModelError(f"frame '{frame}' was given as a position only; give (rotation, p)")
         return pose[0]
 
     def position(self, frame: str, point: ArrayLike = ORIGIN) -> ca.SX:
-        offset = numbers("point", point)
-        if frame == "world":
-            return ca.SX(offset)
-        pose = self._pose(frame)
+        offset, pose = numbers("point", point), self._pose(frame)
         origin = pose[1] if isinstance(pose, tuple) else pose
         return origin + ca.mtimes(self.rotation(frame), offset) if offset.any() else origin
 
-    def _pose(self, frame: str) -> ca.SX | tuple[ca.SX, ca.SX]:
-        if frame not in self.frames:
-            raise ModelError(unknown_name("frame", frame, ["world", *self.frames]))
-        return self.frames[frame]
-
-    def landmarks(self) -> ca.SX:
-        return ca.horzcat(ca.SX(3, 1), *[self.position(frame) for frame in self.frames])
-
     def kinematics(self, acceleration: ca.SX | None = None) -> "TextbookKinematics":
-        if acceleration is None:
-            acceleration = ca.SX.sym("acceleration", self.v.numel())
         return TextbookKinematics(self, acceleration)
 
 
 class TextbookKinematics(Kinematics):
     """Frames whose poses are expressions of q and are differentiated directly."""
 
-    def __init__(self, links: LinkExpressions, acceleration: ca.SX) -> None:
+    def __init__(self, links: LinkExpressions, acceleration: ca.SX | None) -> None:
+        if acceleration is None:
+            acceleration = ca.SX.sym("acceleration", links.v.numel())
         self.q, self.v, self.acceleration = links.q, links.v, acceleration
-        self.position_signals = links.position_signals
-        self._links = links
+        self.position_signals, self._links = links.position_signals, links
         self._moving = ca.vertcat(links.q, links.v)
         self._rate = ca.vertcat(ca.mtimes(links.velocity_map, links.v), acceleration)
 

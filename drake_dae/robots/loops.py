@@ -151,11 +151,6 @@ class LoopJoint(Constraint):
         held, turned = ([LETTERS.index(axis) for axis in axes] for axes in self.held_axes)
         return held, turned
 
-    @property
-    def _own(self) -> int:
-        """The number of the joint's axis."""
-        return LETTERS.index(self.axis)
-
     def _base(self, frames: Frames) -> tuple[ca.SX, ca.SX]:
         """R_WF and p_WF."""
         rotation = ca.mtimes(frames.rotation(self.frame_a), _rotation(self.rpy_a))
@@ -221,13 +216,14 @@ class RevoluteLoopJoint(LoopJoint):
     def residual(self, frames: Frames) -> ca.SX:
         R_FM, p_FM = self._relative(frames)
         held, turned = self._held
-        axis = R_FM[:, self._own]
-        tilt = 2 / (1 + axis[self._own]) * ca.cross(ca.SX(np.eye(3)[self._own]), axis)
+        a = LETTERS.index(self.axis)
+        tilt = 2 / (1 + R_FM[a, a]) * ca.cross(ca.SX(np.eye(3)[a]), R_FM[:, a])
         return ca.vertcat(p_FM[held], tilt[turned])
 
     def coordinates(self, frames: Frames) -> ca.SX:
         R_FM, _ = self._relative(frames)
-        b, c = (self._own + 1) % 3, (self._own + 2) % 3  # b x c = a.
+        a = LETTERS.index(self.axis)
+        b, c = (a + 1) % 3, (a + 2) % 3  # b x c = a.
         sine, cosine = R_FM[c, b] - R_FM[b, c], R_FM[b, b] + R_FM[c, c]
         s, k = np.sin(self._middle), np.cos(self._middle)
         return self._middle + ca.atan2(sine * k - cosine * s, cosine * k + sine * s)
@@ -276,7 +272,7 @@ class PrismaticLoopJoint(LoopJoint):
         return ca.vertcat(p_FM[held], rotation_error(R_FM)[turned])
 
     def coordinates(self, frames: Frames) -> ca.SX:
-        return self._relative(frames)[1][self._own]
+        return self._relative(frames)[1][LETTERS.index(self.axis)]
 
 
 def _rotation(rpy: Vector) -> ca.SX:

@@ -62,35 +62,16 @@ class MultibodyExpressions(Links):
 
         M(q) v' + H(q, v) = B u,    q' = N(q) v,
 
-    as CasADi SX expressions, by the composite rigid body and the recursive Newton-Euler algorithm
-    in link frames (Featherstone, Rigid Body Dynamics Algorithms, 2008). H holds the Coriolis and
-    centrifugal forces, gravity, joint damping, and the springs RevoluteSpring, PrismaticSpring and
-    LinearSpringDamper; M holds the reflected inertia of the rotors. Contact, locked joints and PD
-    controllers of actuators are not included: u acts on the joints. The plant's constraints, such
-    as mimic joints, are not included either: `RobotModel` reads them from the plant.
+    as CasADi SX expressions in Drake's order, by the algorithms of `tree`. H holds joint damping
+    and the springs RevoluteSpring, PrismaticSpring and LinearSpringDamper, M the reflected inertia
+    of the rotors. Contact, locked joints, PD controllers of actuators, effort limits, and the
+    plant's constraints are not included; `RobotModel` reads these. M, N and H are compared with the
+    plant's own values at random states.
 
-    All data comes from the plant and is in SI units (m, kg, s, rad, N, N m); q, v and u have
-    Drake's order. On construction M, N and H are compared with the plant's own values at random
-    states.
-
-    Args:
-        plant: The plant.
-        scene_graph: The scene graph with its geometry; without one links are their origins.
-
-    Attributes:
-        parameters: The mass in kg of every body that has one, "<body>.mass". As in
-            RigidBody.SetMass, center of mass and unit inertia do not change with it. The place of a
-            point mass in m, shape (3,), is "<body>.center".
-        position_signals, velocity_signals: Names and units of q ("joint1", "base_qx") and of v
-            ("joint1_w", "base_wx"), unique in both together; a joint name that several model
-            instances use is written "instance::joint1".
-        effort_limits: The largest |u|, shape (nu,), inf without a limit. Drake's plant clips u to
-            them; these equations do not.
-        Others: as in `Links`.
-
-    Raises:
-        ModelError: The plant is not finalized, cannot move, or has a joint or force element that
-            is not supported; or the comparison with the plant failed.
+    Parameters are the mass in kg of every body, "<body>.mass", with which center of mass and unit
+    inertia do not change, and the place of a point mass in m, "<body>.center". Names of q are as
+    "joint1" and "base_qx", of v "joint1_w" and "base_wx"; those that several model instances use
+    are written "instance::joint1". Without the scene graph, links are their origins.
     """
 
     def __init__(self, plant: MultibodyPlant, scene_graph: SceneGraph | None = None) -> None:
@@ -153,12 +134,7 @@ class MultibodyExpressions(Links):
     def position(self, frame: str | Frame, point: ArrayLike = ORIGIN) -> ca.SX:
         return position_of(self.pose(self.find(frame)), point)
 
-    def landmarks(self) -> ca.SX:
-        """The origins of all bodies, in m, shape (3, k), the world's first."""
-        return ca.horzcat(*[self.position(body.body_frame()) for body in self._bodies])
-
     def kinematics(self, acceleration: ca.SX | None = None) -> "TreeKinematics":
-        """The frames in motion with v' = `acceleration`, a symbol if None."""
         if acceleration is None:
             return TreeKinematics(self, *self._moving)
         moving = link_motions(self.links, self.v, acceleration, self.gravity)
@@ -311,11 +287,7 @@ class MultibodyExpressions(Links):
         return self.plant.gravity_field().gravity_vector()
 
     def _compare_with_plant(self) -> None:
-        """Compares M, H and N v with the plant's own values at three random states.
-
-        The error is the largest absolute difference, over the largest entry or over that of M if
-        that is larger: forces that cancel have no scale of their own.
-        """
+        """Compares M, H and N v with the plant's own values at three random states."""
         names = "mass matrix", "bias", "velocity map"
         ours = self.mass_matrix, self.bias, self.velocity_map @ self.v
         symbols = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in self.parameters])
@@ -339,6 +311,7 @@ class MultibodyExpressions(Links):
                     "no link that moves has mass or inertia; give each of them an <inertial>, or "
                     "weld it to one that has"
                 )
+            # Forces that cancel have no scale of their own.
             scales = np.abs(mass).max(), np.abs(mass).max(), 1.0
             own = function(*state, values)
             for name, one, other, scale in zip(names, own, theirs, scales, strict=True):
@@ -361,11 +334,7 @@ class MultibodyExpressions(Links):
 
 @dataclass(frozen=True, eq=False)
 class _FrameSymbols:
-    """The symbols of a moving frame F, all in the world W.
-
-    R_WF' is a symbol besides w, although R_WF' = w x R_WF. So orientation constraints are
-    differentiated without products that the recursions have already computed.
-    """
+    """The symbols of a moving frame, in the world; R' besides w saves products."""
 
     rotation: ca.SX = field(default_factory=lambda: ca.SX.sym("R", 3, 3))
     rotation_rate: ca.SX = field(default_factory=lambda: ca.SX.sym("R'", 3, 3))
@@ -377,8 +346,8 @@ class _FrameSymbols:
 class TreeKinematics(Kinematics):
     """The frames of a plant in motion; `moving` is how each link moves.
 
-    Constraints are differentiated by a few symbols of frames and not through the joints; the
-    recursions of the tree give the motion of the frames in far fewer operations.
+    Constraints are differentiated by symbols of frames: recursions give the motion of these in far
+    fewer operations than derivatives through the joints.
     """
 
     def __init__(

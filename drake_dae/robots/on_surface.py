@@ -174,9 +174,11 @@ class PointOnSurface(Constraint):
             return pushed
         return pushed + kinematics.push(self.frame, pull * constraint_force, self.point)
 
-    def drag(self, kinematics: Kinematics) -> Reaction | None:
+    def drag(self, kinematics: Kinematics) -> Reaction:
         drag = self._drag(kinematics)
-        return None if drag is None else kinematics.push(self.frame, drag, self.point)
+        if drag is None:
+            return super().drag(kinematics)
+        return kinematics.push(self.frame, drag, self.point)
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         push, pull = self.normal(kinematics), self._pull(kinematics)

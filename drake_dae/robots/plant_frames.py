@@ -38,7 +38,7 @@ def frame_named(plant: MultibodyPlant, name: str) -> Frame:
     """A frame of a plant by its name; "instance::name" if several have that name."""
     if name == "world":
         return plant.world_frame()
-    frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
+    frames = _frames(plant)
     matches = [frame for frame in frames if name in (frame.name(), scoped_name(plant, frame))]
     if len(matches) == 1:
         return matches[0]
@@ -60,9 +60,11 @@ def frame_name(plant: MultibodyPlant, frame: Frame) -> str:
     """The name by which `frame_named` finds a frame."""
     if frame is plant.world_frame():
         return "world"
-    frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
-    is_unique = [other.name() for other in frames].count(frame.name()) == 1
-    return str(frame.name()) if is_unique else scoped_name(plant, frame)
+    return unique_names(plant, _frames(plant))[int(frame.index())]
+
+
+def _frames(plant: MultibodyPlant) -> list[Frame]:
+    return [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
 
 
 def scoped_name(plant: MultibodyPlant, item: Any) -> str:
@@ -128,14 +130,8 @@ def _corners(shape: object) -> tuple[FloatArray, float]:
 
 
 SUPPORTED_JOINTS = (
-    RevoluteJoint,
-    PrismaticJoint,
-    WeldJoint,
-    ScrewJoint,
-    UniversalJoint,
-    PlanarJoint,
-    BallRpyJoint,
-    RpyFloatingJoint,
+    *(RevoluteJoint, PrismaticJoint, WeldJoint, ScrewJoint),
+    *(UniversalJoint, PlanarJoint, BallRpyJoint, RpyFloatingJoint),
 )
 
 
@@ -174,10 +170,8 @@ def elementary_joints(
         return ElementaryJoint(axis, (i + k,), (j + k,), unit[:, [axis]])
 
     def shift(directions: FloatArray, first: int = 0) -> ElementaryJoint:
-        places = range(first, first + directions.shape[1])
-        return ElementaryJoint(
-            None, tuple(i + k for k in places), tuple(j + k for k in places), directions
-        )
+        places = np.arange(first, first + directions.shape[1])
+        return ElementaryJoint(None, tuple(i + places), tuple(j + places), directions)
 
     # R_FM = Rz(yaw) Ry(pitch) Rx(roll); the first turn carries the angular velocity in F.
     roll_pitch_yaw = [

@@ -48,8 +48,8 @@ class Blade(_RestingPoint):
     constraint force is the side force in N that the ground exerts on the frame at the point,
     positive along the axis; the ground gets the opposite.
 
-    It does not restrict the height; use a joint or a `PointOnSurface` for that. A start in motion
-    must not have a sideways velocity. Two blades on one axle are redundant.
+    It does not restrict the height; use a joint or a `PointOnSurface` for that. Two blades on one
+    axle are redundant.
 
     Attributes:
         frame: Name of the frame.

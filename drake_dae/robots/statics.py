@@ -27,10 +27,9 @@ class StaticPlacement:
     def solve(
         self, outputs: FloatArray, guess: FloatArray, parameters: FloatArray, of_outputs: FloatArray
     ) -> FloatArray:
-        """A solution near a guess; InconsistentStateError if there is none. Nothing is checked.
+        """A solution near a guess for the first components of z_1; the others are free.
 
-        `outputs` are the first components of z_1, the others are free; `parameters` are the values
-        of all parameters for phi, `of_outputs` those for h_1.
+        `parameters` are the values of all parameters for phi, `of_outputs` those for h_1.
         """
         count = outputs.size
         evaluated = once(lambda q: self._function(q, parameters, of_outputs))
@@ -104,15 +103,12 @@ class StaticBalance:
         """The state at rest, lambda, and the largest remaining residual, at positions, for z_2."""
         evaluated = once(lambda unknown: self._function(q, forces, unknown, parameters))
 
-        def residual(unknown: FloatArray) -> FloatArray:
-            return evaluated(unknown)[0]
-
         def linearize(unknown: FloatArray) -> NewtonModel | None:
             balance, gradient, _ = evaluated(unknown)
             gradient = gradient.reshape(balance.size, -1)
             # Currents and forces differ by orders of magnitude.
             scale = np.maximum(np.linalg.norm(gradient, axis=0), np.finfo(float).tiny)
-            steps = shortest_steps(gradient / scale, residual)
+            steps = shortest_steps(gradient / scale, lambda x: evaluated(x)[0])
             if steps is None:
                 return None
             return NewtonModel(lambda x: steps.step(x) / scale, steps.is_regular)

@@ -19,10 +19,7 @@ from drake_dae.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class ElementaryJoint:
-    """X_FM(q) of one elementary joint: a rotation about a coordinate axis of F, or a translation.
-
-    A joint of a plant is a sequence of these; each starts from the frame where the one before ends.
-    """
+    """X_FM(q), a rotation about an axis of F or a translation; a joint is a chain of these."""
 
     axis: int | None  # Of the turn, 0, 1 or 2; None for a shift.
     positions: tuple[int, ...]  # In q: of the angle, or of the lengths along `directions`.
@@ -32,10 +29,7 @@ class ElementaryJoint:
 
 @dataclass(eq=False)
 class Inertia:
-    """Mass m, and the integrals of r dm and r r^T dm about an origin.
-
-    The rotational inertia is tr(second) 1 - second.
-    """
+    """Mass, and the integrals of r dm and r r^T dm about an origin."""
 
     mass: ca.SX = field(default_factory=lambda: ca.SX.zeros(1))
     first: ca.SX = field(default_factory=lambda: ca.SX.zeros(3))
@@ -182,15 +176,12 @@ def frame_jacobian(
 
 @dataclass(frozen=True, eq=False)
 class LinkMotion:
-    """The motion of a link, in its own axes; a point r has `acceleration` + gradient r.
-
-    Gravity is an upward acceleration of the world.
-    """
+    """The motion of a link, in its own axes; a point r has `acceleration` + gradient r."""
 
     spin: ca.SX
     spin_rate: ca.SX
-    velocity: ca.SX  # Of the origin, as its acceleration minus gravity.
-    acceleration: ca.SX
+    velocity: ca.SX  # Of the origin.
+    acceleration: ca.SX  # Of the origin, minus gravity.
     gradient: ca.SX  # Shape (3, 3).
 
 
@@ -198,11 +189,8 @@ def link_motions(
     links: Sequence[TreeLink], v: ca.SX, acceleration: ca.SX, gravity: FloatArray
 ) -> list[LinkMotion]:
     """The motion of every link, with v' = `acceleration`; gravity is in the world, in m/s^2."""
-    result = [
-        LinkMotion(
-            ca.SX.zeros(3), ca.SX.zeros(3), ca.SX.zeros(3), ca.SX(-gravity), ca.SX.zeros(3, 3)
-        )
-    ]
+    zero = ca.SX.zeros(3)
+    result = [LinkMotion(zero, zero, zero, ca.SX(-gravity), ca.SX.zeros(3, 3))]
     for link in links[1:]:
         parent, to_link = result[link.parent], link.rotation.T
         turning, turning_rate, shifting, shifting_rate = (

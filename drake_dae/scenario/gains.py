@@ -1,10 +1,11 @@
 """The gains and the estimator that a scenario with contact that gives way leaves out."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from drake_dae.dae import AdvisedGains, ContactGains, Structure, advised_gains, contact_gains
+from drake_dae.dae import AdvisedGains, Structure, advised_gains, contact_gains
 from drake_dae.dae.advised_gains import settles_along
 from drake_dae.errors import GainError, ScenarioError
 from drake_dae.robots import JointFriction, Plane, PointOnSurface, RobotModel, velocities_are_rates
@@ -12,7 +13,6 @@ from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.expected import (
     PATCH_FORCE,
-    Touch,
     expected,
     jam,
     least_damping,
@@ -21,6 +21,7 @@ from drake_dae.scenario.expected import (
     sensed_contact,
     stated_errors,
     timing,
+    with_lasting_touches,
 )
 from drake_dae.scenario.form import at
 from drake_dae.scenario.model import references_of
@@ -67,22 +68,23 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         ScenarioError: There are no default gains for such a scenario, or none are smooth and stable
             enough; or `largest_roughness` or `largest_errors` is given and not used.
     """
-    material = scenario.plant.material
-    law, sensors = scenario.law, scenario.sensors
-    _check_bounds(scenario)
+    material, law, sensors = scenario.plant.material, scenario.law, scenario.sensors
+    for name in ("largest_roughness", "largest_errors"):
+        is_used = scenario.is_advised and sensors.encoders is not None
+        if getattr(law, name) is not None and not is_used:
+            text = (
+                "it is used only if `law.gains` is left out, `sensors.encoders` is given, and the "
+                "plant is !CompliantContact or !MultibodyPlant; leave it out, or change these"
+            )
+            raise ScenarioError((f"law.{name}", text))
     if material is None or not scenario.is_advised:
         return Completed(scenario)
-    if model.stages:
-        text = (
-            "no gains are computed if the robot has springs, motors or valves. Give gains, "
-            "integral and estimator, as in the scenario wall_flexible_contact"
-        )
-        raise ScenarioError(("law.gains", text))
     period, late = timing(scenario)
-    if not period:
+    if model.stages or not period:
         text = (
-            "for a continuous compliant plant without `sampling` no gains are computed; give some, "
-            "or a sampling"
+            "no gains are computed if the robot has springs, motors or valves, nor for a "
+            "continuous compliant plant without `sampling`. Give gains, integral and estimator, as "
+            "in the scenario wall_flexible_contact"
         )
         raise ScenarioError(("law.gains", text))
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
@@ -94,62 +96,53 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         with at("law.gains"):
             best, outlook = _sensed_gains(scenario, model, structure, stiffness)
         contact, fast, known_by = best.gains, best.state_rate, "these encoders"
+
+    # The law. A force of degree 0 has a gain only if it is integrated.
     names = [signal.name for signal in model.dae.output_signals]
-    positions, forces = np.split(np.array(names), [len(model.position_signals)])
-    points = moved_points(model)
-    integral = law.integral
+    positions, forces = names[: len(model.position_signals)], names[len(model.position_signals) :]
+    integral, points = law.integral, moved_points(model)
     if integral is None:
-        integral = [name for name in positions if name in points] + forces.tolist()
-    force = sensors.force or parts.MeasuredForce(sample_period=period)
-    # A force of degree 0 has a gain only if it is integrated.
-    of_forces = {
-        name: [rounded(contact.force_gain)] for name in forces.tolist() if name in integral
-    }
-    of_positions = {
-        name: [rounded(gain) for gain in contact.position_gains(3 if name in integral else 2)]
-        for name in positions.tolist()
-    }
-    gains = parts.Coefficients(outputs=of_positions | of_forces)
+        integral = [name for name in positions if name in points] + forces
+    of_outputs = {n: contact.position_gains(3 if n in integral else 2) for n in positions}
+    of_outputs |= {name: [contact.force_gain] for name in forces if name in integral}
     damping = law.constraint_damping
     if damping is None and contact.constraint_damping:
         damping = parts.Poles(all=[-rounded(contact.constraint_damping)])
+
+    # The estimator.
     estimator = scenario.estimator or parts.Estimator()
     frictional = [c.friction_parameter for c in model.constraints if c.friction_parameter]
     if estimator.rate is None:
+        named = estimator.parameters
         estimator = replace(
             estimator,
             rate=rounded(contact.observer_rate),
             force_rate=rounded(contact.observer_force_rate),
             friction_rate=rounded(contact.friction_rate),
-            parameters=None
-            if estimator.parameters is None
-            else list(dict.fromkeys([*frictional, *estimator.parameters])),
+            parameters=None if named is None else list(dict.fromkeys([*frictional, *named])),
             state_rate=None if fast is None else rounded(fast),
         )
-    if not estimates_all(replace(scenario, estimator=estimator), model):
-        named = frictional if estimator.parameters is None else estimator.parameters
-        estimator = replace(estimator, parameters=named)
-    task = scenario.task
-    if task is not None and task.gains is None:
-        task = replace(task, gains=_free_gains(scenario, model, contact))
-    touch_note = ""
+    given = replace(scenario, estimator=estimator)
+    if estimator.parameters is None and not estimates_all(given, model):
+        estimator = replace(estimator, parameters=frictional)
+
+    # The task: soft along the distance while the contact is open, see `TaskController`.
+    task, touch_note = scenario.task, ""
     if task is not None:
-        touching = Touch(
-            stiffness,
-            mobility,
-            contact.constraint_damping if damping is None else least_damping(structure, damping),
-            contact.force_gain,
-            period,
-            late=period * (1 + late),
-        )
-        task = touching.slowed(task)
-        touch_note = touching.note(task)
+        if task.gains is None:
+            free = {signal.name: contact.position_gains(2) for signal in model.position_signals}
+            rate = contact.position_rate / _SOFTER
+            for point in opening_contact(scenario, model):
+                free[point.residual_signals[0].name] = [rate**2, 2.0 * rate]
+            task = replace(task, gains=_coefficients(free))
+        acting = least_damping(structure, damping), contact.force_gain, period, period * (1 + late)
+        task, touch_note = with_lasting_touches(task, stiffness, mobility, *acting)
     chosen = replace(
         scenario,
         task=task,
         law=replace(
             law,
-            gains=gains,
+            gains=_coefficients(of_outputs),
             integral=integral,
             constraint_damping=damping,
             contact_stiffness=_fed_ahead(scenario, structure, stiffness),
@@ -157,12 +150,13 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             largest_errors=None,
         ),
         estimator=estimator,
-        sensors=replace(sensors, force=force),
+        sensors=replace(sensors, force=sensors.force or parts.MeasuredForce(sample_period=period)),
     )
-    stated = stated_errors(chosen, model, structure)
-    named = estimator.parameters or []
-    identified = ", ".join(name for name in named if name in frictional) or "none"
-    if estimator.parameters is None:
+
+    # What it is, in words.
+    stated, named = stated_errors(chosen, model, structure), estimator.parameters
+    identified = ", ".join(name for name in named or () if name in frictional) or "none"
+    if named is None:
         identified = "friction, loads, tilts and places of planes"
         if scenario.compliances is not None:
             identified = "friction and loads"
@@ -178,6 +172,10 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     )
     told = note, jam(scenario, model, structure, material.friction)
     return Completed(chosen, tuple(filter(None, told)))
+
+
+def _coefficients(gains: Mapping[str, Sequence[float]]) -> parts.Coefficients:
+    return parts.Coefficients(outputs={n: [*map(rounded, own)] for n, own in gains.items()})
 
 
 def _sensed_gains(
@@ -229,29 +227,6 @@ def _fed_ahead(scenario: Scenario, structure: Structure, stiffness: float) -> fl
     except ScenarioError:
         return None
     return rounded(stiffness)
-
-
-def _check_bounds(scenario: Scenario) -> None:
-    """Refuses bounds for computed gains where none are computed by them."""
-    is_used, law = scenario.is_advised and scenario.sensors.encoders is not None, scenario.law
-    for name in ("largest_roughness", "largest_errors"):
-        if getattr(law, name) is not None and not is_used:
-            text = (
-                "it is used only if `law.gains` is left out, `sensors.encoders` is given, and the "
-                "plant is !CompliantContact or !MultibodyPlant; leave it out, or change these"
-            )
-            raise ScenarioError((f"law.{name}", text))
-
-
-def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) -> parts.Coefficients:
-    """The gains of a task without contact, soft along the distance: see `TaskController`."""
-    rate = contact.position_rate / _SOFTER
-    gains = {signal.name: contact.position_gains(2) for signal in model.position_signals}
-    for point in opening_contact(scenario, model):
-        gains[point.residual_signals[0].name] = [rate**2, 2.0 * rate]
-    return parts.Coefficients(
-        outputs={name: [rounded(gain) for gain in values] for name, values in gains.items()}
-    )
 
 
 def estimates_all(scenario: Scenario, model: RobotModel) -> bool:

@@ -158,7 +158,7 @@ def newton(
         step = step_from(x)
         size = length_of(step)
         if size <= ROUNDING:
-            return _polished(x, step, step_from), regular
+            return polished(x, step, step_from), regular
         value = size if measure is None else measure(x)
         for length in LENGTHS:
             trial = x + (step if length == 1.0 else length * step)
@@ -167,7 +167,7 @@ def newton(
                 left = length_of(following)
                 if left * left <= PRECISION * size:
                     # The next step would be left / size times as long.
-                    return _polished(trial, following, step_from), regular
+                    return polished(trial, following, step_from), regular
             else:
                 left = measure(trial)
             if left <= (1.0 - 0.25 * length) * value:
@@ -191,7 +191,7 @@ def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
     return evaluated
 
 
-def _polished(
+def polished(
     state: FloatArray, step: FloatArray, step_from: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
     """Returns the state after a step and all following ones, until they are round-off."""

@@ -44,7 +44,6 @@ def test_errors_are_those_of_one_more_pole():
         integral=["tool.z", "wall.force"],
     )
     assert tracking.gains.degrees == (3, 1)
-    assert not tracking.control_takes_force
     loop, record = follow(model, tracking, 2.0, start=[0.01, 0.5])
     predicted = loop.predicted_error(record)
     assert predicted[0] == pytest.approx([-0.02, -3.0])
