@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems import redundant, system_of
-from problems.tables import TABLE, plate
+from problems.made_up import TABLE, plate
 
 from drake_dae import DaePlant, DaeSystem, drop_constraints, find_structure, share_forces
 from drake_dae.errors import AssumptionError, ModelError

@@ -26,7 +26,7 @@ from drake_dae import (
 from drake_dae.dae import with_disturbance
 from drake_dae.dae.filters import ChainFilter, transition
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.build import roll_scenario
 from drake_dae.systems import ControlHold, Observing
 from drake_dae.systems.sensors import StateSensor
 
