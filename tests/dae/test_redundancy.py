@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from problems import redundant, system_of
-from problems.tables import TABLE, plate
+from problems.made_up import TABLE, plate
 
 from drake_dae import DaePlant, drop_constraints, find_structure
 from drake_dae.errors import AssumptionError, ModelError

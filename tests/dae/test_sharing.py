@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems import system_of
-from problems.tables import TABLE, plate
+from problems.made_up import TABLE, plate
 
 from drake_dae import DaePlant, DaeSystem, drop_constraints, share_forces
 from drake_dae.errors import ModelError

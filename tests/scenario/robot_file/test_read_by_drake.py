@@ -315,11 +315,7 @@ MASSES = {
     ".sdf": "<inertial><mass>2</mass></inertial>",
     ".xml": '<inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/>',
 }
-OF_DRAKE = {
-    "ball": "",
-    "universal": "",
-    "screw": '<drake:screw_thread_pitch value="0.1"/>',
-}
+OF_DRAKE = {"ball": "", "universal": "", "screw": '<drake:screw_thread_pitch value="0.1"/>'}
 
 
 def one_joint(kind: str, form: str, limit: str = "", dynamics: str = "", rest: str = "") -> str:
