@@ -49,19 +49,13 @@ from drake_dae.scenario.form import at, dump_yaml
 from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
-<<<<<<< HEAD
 from drake_dae.scenario.robot_file.reading import (
-    RobotLinks,
     finalize,
     joints_of,
     needs_of,
     read_robot,
     robot_links,
 )
-=======
-from drake_dae.scenario.robot_file.changes import joints_of
-from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot, robot_links
->>>>>>> main
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
