@@ -23,8 +23,14 @@ from drake_dae.blocks.stepping import (
     tableau_of,
 )
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.compiled import Compiled, generate, library, renamed, without_branches
-from drake_dae.trace.compiler import gcc_options
+from drake_dae.trace.compiled import (
+    Compiled,
+    gcc_options,
+    generate,
+    library,
+    renamed,
+    without_branches,
+)
 
 FOLDER = Path(__file__).parent
 

@@ -24,7 +24,7 @@ from drake_dae.errors import (
 from drake_dae.files import check_unwritten
 from drake_dae.robots import Vector
 from drake_dae.running.simulate import simulate
-from drake_dae.scenario.build import build_completed, build_scenario
+from drake_dae.scenario.build import build_commanded, build_completed, build_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
 from drake_dae.scenario.new import placed_scenario
 from drake_dae.scenario.robot_file.reading import RobotLinks
@@ -109,7 +109,6 @@ def analyze_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 def page_command(options: argparse.Namespace) -> int:
     """Compiles a scenario into a page."""
     from drake_dae.pictures.page.page import write_page
-    from drake_dae.scenario.rolled import build_commanded
 
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)

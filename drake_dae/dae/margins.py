@@ -12,7 +12,7 @@ from drake_dae.dae.contacts import critical_factor
 from drake_dae.dae.samples import Samples
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.round_off import equilibration, smallest_singular_value
+from drake_dae.trace.numerics import equilibration, smallest_singular_value
 
 # Critical coefficients above this are meaningless: they occur where sliding is only round-off.
 MEANINGLESS = 1e6

@@ -13,8 +13,7 @@ from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.expressions import find_flaw
-from drake_dae.trace.newton import NewtonModel, newton
-from drake_dae.trace.round_off import unit_rows
+from drake_dae.trace.numerics import NewtonModel, newton, unit_rows
 
 # Single states complete the chains if the sine of their smallest angle is above this.
 TRANSVERSAL = 0.05

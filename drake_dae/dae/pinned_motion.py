@@ -25,8 +25,7 @@ from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.expressions import result_of
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.numerics import NewtonModel, newton, positive, shortest_steps
 
 # A or B counts as singular below this fraction of its usual margin, also if it is a single number.
 VANISHED = 1e-9

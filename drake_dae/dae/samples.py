@@ -13,8 +13,7 @@ from drake_dae.arrays import FloatArray, brief, numbers, show
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import NewtonModel, newton
-from drake_dae.trace.round_off import are_dependent, positive
+from drake_dae.trace.numerics import NewtonModel, are_dependent, newton, positive
 
 # The allowed distance of a state from the box after Newton's method, relative to the box.
 SLACK = 1e-6

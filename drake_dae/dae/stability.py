@@ -22,8 +22,7 @@ from drake_dae.dae.manifold import coordinates, tangent
 from drake_dae.dae.pinned_motion import GROWN, PinnedMotion, PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
-from drake_dae.trace.round_off import DEPENDENT
+from drake_dae.trace.numerics import DEPENDENT, ROUND_OFF, NewtonModel, newton, shortest_steps
 
 LINEARIZED = 1e-11  # The error of a linearization, relative to the terms in each of its entries.
 ROUNDED = 1e-15  # The error of computed eigenvalues, relative to the norm of the matrix.

@@ -20,8 +20,7 @@ from drake_dae.dae.assumptions import (
     find_dependence,
     redundant_constraints,
 )
-from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import Elimination, eliminate
+from drake_dae.dae.derivatives import Derivatives, Elimination, eliminate
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.margins import RankMargin, find_margin
 from drake_dae.dae.redundancy import all_constraints_hold
@@ -32,7 +31,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.factorization import Factorization, nearest_solution
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibrated, equilibration, positive, smallest_singular_value
+from drake_dae.trace.numerics import equilibrated, equilibration, positive, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 
@@ -133,20 +132,6 @@ class Structure(ConstraintStructure):
     def chain(self) -> ca.SX:
         """The output chains in one column, in the order of `layout`, shape (sum mu_i, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[e for chain in self.output_chains for e in chain])
-
-    def motion_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """Returns x', v and a pivot under the control of `control_for`, solved together with it.
-
-        None if the control is not found in this way, or if friction may leave the motion
-        undetermined.
-        """
-        if self.system.control_metric is not None or self.system.frictional_contacts:
-            return None
-        motion, size = self.derivatives, self.system.num_states
-        shown = ca.vertcat(motion.rate, motion.constraint_input)
-        if (solution := motion.inverse(self.highest_derivatives, commanded, shown)) is None:
-            return None
-        return solution[2][:size, :], solution[2][size:, :], solution[1]
 
     def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Returns u = B(x)^-1 (-a(x) + ubar) (28), and a scalar that is 0 where it is undetermined.

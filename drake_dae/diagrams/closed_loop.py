@@ -18,12 +18,11 @@ from drake_dae.dae import Signal
 from drake_dae.diagrams.parts import encoder_seed as seed_of_encoders
 from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.control.contract import Controller, PhaseChange
-from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.observing.estimator import StateEstimator
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.encoders import StateSensor
-from drake_dae.systems.sensing.force_sensor import ForceSensor
+from drake_dae.systems.controller import Controller, PhaseChange
+from drake_dae.systems.estimator import StateEstimator
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.references import ReferenceGenerator
+from drake_dae.systems.sensors import ForceSensor, StateSensor
 
 
 @checked(WiringError)

@@ -15,15 +15,13 @@ from drake_dae.arrays import unknown_name
 from drake_dae.errors import WiringError
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import velocities_are_rates
-from drake_dae.systems.control.commanded import CommandedReferences
-from drake_dae.systems.control.contract import SIGNAL, Controller
-from drake_dae.systems.control.drives import Sampling
-from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.observing.estimator import StateEstimator
-from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.encoders import Encoders, StateSensor
-from drake_dae.systems.sensing.force_sensor import ForceSensor
+from drake_dae.systems.applied_control import Sampling
+from drake_dae.systems.break_away import Observing
+from drake_dae.systems.controller import SIGNAL, Controller
+from drake_dae.systems.estimator import StateEstimator
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.references import CommandedReferences, ReferenceGenerator
+from drake_dae.systems.sensors import Encoders, ForceSensor, StateSensor
 
 ENCODER_NOISE = "encoder_noise"
 """The name of the source of the noise of encoders."""

@@ -25,12 +25,10 @@ from drake_dae.diagrams.parts import (
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.references import Reference, references_by_name
 from drake_dae.scene.view import add_live_view
-from drake_dae.systems.control.commanded import CommandedReferences
-from drake_dae.systems.control.contract import Controller, check_law
-from drake_dae.systems.control.controller import TrackingController
-from drake_dae.systems.control.drives import ControlHold, ControlLimits
-from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.applied_control import ControlHold, ControlLimits
+from drake_dae.systems.controller import Controller, TrackingController, check_law
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.references import CommandedReferences, ReferenceGenerator
 
 Named = dict[str, tuple[OutputPort, Sequence[Signal]]]
 """Name -> output port, names and units of a recorded signal."""

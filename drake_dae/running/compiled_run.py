@@ -27,7 +27,7 @@ from drake_dae.blocks.compose import Leaves, compose
 from drake_dae.blocks.primitives import symbolic_block
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.errors import DrakeDaeError
-from drake_dae.systems.plants.contract import plants_in
+from drake_dae.systems.plant import plants_in
 
 EVERY = 32  # The number of steps after which the context of the diagram as wired gets the results.
 # The least number of steps for which composing the diagram takes less time than it saves.

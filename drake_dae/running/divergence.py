@@ -7,7 +7,7 @@ from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import SimulationError
 from drake_dae.running.judgement import unit_sizes
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plant import Plant
 
 # An error diverges at this many sizes of its output, as a mean over the window, and at once. The
 # mean is that of logarithms, so that the peak of an impact hardly counts.

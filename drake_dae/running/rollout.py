@@ -36,7 +36,7 @@ from drake_dae.running.diagnosis import IN_ROLLOUT, MANY, explained, too_long, w
 from drake_dae.running.drake_stepped import run_stepped
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, Seed, program_of
 from drake_dae.running.simulate import check_config
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plant import Plant
 from drake_dae.trace.compiled import Compiled, check_choice
 
 SEVERAL = 8  # The least number of runs that go side by side; fewer give the bits of single runs.

@@ -12,7 +12,7 @@ from pydrake.geometry import SceneGraph
 from drake_dae.analysis import robot_limits
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae import DaeSystem, Structure, ZeroDynamics, find_structure
+from drake_dae.dae import DaeSystem, PinnedMotion, Structure, ZeroDynamics, find_structure
 from drake_dae.errors import (
     AssumptionError,
     DrakeDaeError,
@@ -200,7 +200,8 @@ def _model(
     with at("parameters"):
         model.dae = model.dae.with_values(scenario.parameters)
     with at("bounds"):
-        model.dae = model.dae.with_bounds(scenario.bounds)
+        bounds = {name: (low, high) for name, (low, high) in scenario.bounds.items()}
+        model.dae = model.dae.with_bounds(bounds)
     return model
 
 
@@ -278,14 +279,21 @@ def reference_and_start(
     return lambda time: stacked(time).copy(), start
 
 
+def motion_along(
+    scenario: Scenario, model: RobotModel, structure: Structure, count: int
+) -> PinnedMotion:
+    """The motion along the references, without errors, at equidistant times."""
+    times = scenario.integrator.start_time + np.linspace(0.0, scenario.duration, count)
+    reference, start = reference_and_start(scenario, model, structure)
+    exogenous = exogenous_references(scenario, model.dae)
+    dynamics = ZeroDynamics(model.dae, structure=structure)
+    return dynamics.motion(reference, times, start, exogenous=exogenous)
+
+
 def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> str:
     """What is in the way along the references, as a sentence; empty if nothing is."""
-    times = scenario.integrator.start_time + np.linspace(0.0, scenario.duration, _TIMES)
     try:
-        reference, start = reference_and_start(scenario, model, structure)
-        exogenous = exogenous_references(scenario, model.dae)
-        dynamics = ZeroDynamics(model.dae, structure=structure)
-        motion = dynamics.motion(reference, times, start, exogenous=exogenous)
+        motion = motion_along(scenario, model, structure, _TIMES)
     except DrakeDaeError as error:
         return str(error)
     if motion.ending is not None:

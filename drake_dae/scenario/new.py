@@ -45,7 +45,7 @@ from drake_dae.robots import (
     joint_names,
     unique_names,
 )
-from drake_dae.scenario.form import at
+from drake_dae.scenario.form import at, dump_yaml
 from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
@@ -59,7 +59,6 @@ from drake_dae.scenario.robot_file.reading import (
 )
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
-from drake_dae.scenario.typed_yaml import dump_yaml
 
 SurfaceKind = Literal["plane", "cylinder", "sphere"]
 

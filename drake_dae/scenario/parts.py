@@ -22,10 +22,10 @@ from drake_dae.robots import (
     WeldedFrames,
 )
 from drake_dae.scenario.robot_file.robot import Pose
-from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.sensing.encoders import Encoders
-from drake_dae.systems.task.phases import Phase
-from drake_dae.systems.task.task import Task
+from drake_dae.systems.break_away import Observing
+from drake_dae.systems.phases import Phase
+from drake_dae.systems.sensors import Encoders
+from drake_dae.systems.task import Task
 
 T = TypeVar("T", Constraint, PositionOutput)
 Positive = Annotated[float, Field(gt=0.0)]

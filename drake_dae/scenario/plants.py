@@ -13,15 +13,15 @@ from pydrake.systems.framework import Context
 from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import RobotModel
-from drake_dae.scenario.form import Expected, at
+from drake_dae.scenario.form import at, expected
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Payload, Robot
-from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.robot_plant import RobotPlant
+from drake_dae.systems.compliant_plant import CompliantPlant
+from drake_dae.systems.contact_forces import DisturbanceForce
+from drake_dae.systems.contact_material import ContactMaterial, PointMaterial
+from drake_dae.systems.contact_plant import ContactPlant
+from drake_dae.systems.ideal_plants import RobotPlant
+from drake_dae.systems.plant import Plant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,12 +134,6 @@ class CompliantContact(PointMaterial, ScenarioPlant):
             return CompliantPlant(model, self, structure=structure)
 
 
-MAKER = Expected(
-    "a module and a class in it, as my_plants:SpringyPlant",
-    Annotated[str, Field(pattern=r"^[^:]+:[^\W\d]\w*$")],
-)
-
-
 @dataclass(frozen=True)
 class OwnPlant(ScenarioPlant):
     """The plant is your own class that follows the contract of `drake_dae.Plant`.
@@ -152,7 +146,11 @@ class OwnPlant(ScenarioPlant):
         maker: The module and the class in it, as "my_plants:SpringyPlant".
     """
 
-    maker: Annotated[str, MAKER]
+    maker: Annotated[
+        str,
+        Field(pattern=r"^[^:]+:[^\W\d]\w*$"),
+        expected("a module and a class in it, as my_plants:SpringyPlant"),
+    ]
     adjusts: ClassVar[bool] = False
 
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:

@@ -14,7 +14,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots import ConstraintSet, LinkDepths, Links, LoopState, Touch
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
+from drake_dae.trace.numerics import NewtonModel, newton, shortest_steps
 
 INDEPENDENT = 0.02
 """Rows with an `independence` below this are dependent or nearly so."""

@@ -24,12 +24,12 @@ from drake_dae.files import read_text
 from drake_dae.references import Reference
 from drake_dae.robots import ForceOutput, Load, Stage, Surface
 from drake_dae.running.simulate import check_config
-from drake_dae.scenario import form, parts, plants, typed_yaml
+from drake_dae.scenario import form, parts, plants
 from drake_dae.scenario.form import Family, Key, Reader, keys_of
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
-from drake_dae.systems.control.drives import Sampling
-from drake_dae.systems.task import phases as ps
+from drake_dae.systems import phases as ps
+from drake_dae.systems.applied_control import Sampling
 from drake_dae.trace.compiled import Compiled
 
 
@@ -104,7 +104,7 @@ class Scenario:
     forces: list[str | ForceOutput] | None = None
     actuation: list[Stage] = field(default_factory=list)
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
-    bounds: dict[str, Annotated[Any, form.INTERVAL]] = field(default_factory=dict)
+    bounds: dict[str, form.Interval] = field(default_factory=dict)
     exogenous: dict[str, list[Reference | float]] = field(default_factory=dict)
     plant: plants.ScenarioPlant = field(default_factory=plants.IdealConstraints)
     law: parts.Law = field(default_factory=parts.Law)
@@ -250,7 +250,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """
     path = find_scenario(str(path))
     try:
-        text = read_text(path, 4 * typed_yaml.MOST_TEXT)
+        text = read_text(path, 4 * form.MOST_TEXT)
         is_shipped = path in shipped_scenarios().values()
         folder = Path().absolute() if is_shipped else path.absolute().parent
     except UnicodeDecodeError:
@@ -264,21 +264,21 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
             "and in one of your own it is robot.file"
         )
         raise ScenarioError((str(path), problem))
-    data, line_of = typed_yaml.load_lines(text, str(path))
+    data, line_of = form.load_lines(text, str(path))
     data = {} if data is None else data
     if isinstance(data, dict):
         # Drake's convention: keys with an underscore are a place for anchors.
-        data = {key: data[key] for key in data if key == typed_yaml.TAG or not key.startswith("_")}
+        data = {key: data[key] for key in data if key == form.TAG or not key.startswith("_")}
     changed = []
     for setting in settings:
         key, separator, value = setting.partition("=")
         if not separator or not all(key.split(".")):
             raise ScenarioError((f"--set {setting}", "expected key=value, for example duration=5"))
-        scenario_reader().put(data, key, typed_yaml.load_yaml(value, key))
+        scenario_reader().put(data, key, form.load_yaml(value, key))
         changed.append(key)
 
     def place_of(key: str) -> str:
-        line = None if typed_yaml.first_name(changed, key) is not None else line_of(key)
+        line = None if form.first_name(changed, key) is not None else line_of(key)
         return "" if line is None else f"[{path.name}:{line}]"
 
     return scenario_reader().read(data, folder, place_of)
@@ -287,4 +287,4 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
     """Writes what differs from defaults, after a first line "# ..." that may be empty."""
     head = f"{comment}\n" if comment else ""
-    Path(path).write_text(head + typed_yaml.dump_yaml(scenario_data(scenario)), encoding="utf-8")
+    Path(path).write_text(head + form.dump_yaml(scenario_data(scenario)), encoding="utf-8")

@@ -8,8 +8,7 @@ import pytest
 from runs import some
 
 from drake_dae.pictures.page.page import in_pieces
-from drake_dae.trace.compiled import generate, without_branches
-from drake_dae.trace.compiler import find_compiler
+from drake_dae.trace.compiled import find_compiler, generate, without_branches
 
 
 def long_function(name, looks_up=False):

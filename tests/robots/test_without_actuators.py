@@ -8,7 +8,7 @@ from vendors import joint, link, robot
 
 from drake_dae import Cylinder, JointPositions, Plane, PointOnSurface, RobotModel
 from drake_dae.errors import ModelError
-from drake_dae.systems.plants.robot_plant import RobotPlant
+from drake_dae.systems.ideal_plants import RobotPlant
 
 SURFACES = Plane((0, 0, 0.3), (0, 0, 1)), Cylinder((0, 0, 0), (0, 0, 1), 0.2)
 

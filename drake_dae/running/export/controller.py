@@ -26,7 +26,7 @@ from drake_dae.running.export.c_code import (
     write_replay,
     written,
 )
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plant import Plant
 from drake_dae.trace.compiled import generate, renamed, without_branches
 
 CONTROL = "control"  # The name of a controller's output port and a plant's input port.

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, ValidationInfo
+from pydantic import AfterValidator, Field, ValidationInfo
 
 from drake_dae.arrays import positive
 from drake_dae.robots import Load, Vector
-from drake_dae.scenario.form import FILE, Expected, in_folder
+from drake_dae.scenario.form import FileName, expected, in_folder
 
 
 @dataclass(frozen=True)
@@ -58,22 +58,23 @@ class Payload:
         positive("the mass of a payload", self.mass)
 
 
-ACTUATORS = Expected(
-    "all, a list of joints, or joints with effort limits in N m or N, positive, or nothing for "
-    "that of the file",
-    Literal["all"] | list[str] | dict[str, Annotated[float, Field(gt=0.0)] | None],
-)
-
-
 def _robot_file(name: str, info: ValidationInfo) -> str:
     return name if name.startswith("package://") else in_folder(name, info)
 
 
-ROBOT_FILE = Expected("the name of a file", str, _robot_file)
-LEFT_OUT = Expected(
-    '"<parent>/<name>" of an element or attribute, inertia, or empty_limits',
-    Annotated[str, Field(pattern="^[^/]+/[^/]|^inertia$|^empty_limits$")],
-)
+RobotFile = Annotated[str, AfterValidator(_robot_file), expected("the name of a file")]
+Actuators = Annotated[
+    Literal["all"] | list[str] | dict[str, Annotated[float, Field(gt=0.0)] | None] | None,
+    expected(
+        "all, a list of joints, or joints with effort limits in N m or N, positive, or nothing for "
+        "that of the file"
+    ),
+]
+LeftOut = Annotated[
+    str,
+    Field(pattern="^[^/]+/[^/]|^inertia$|^empty_limits$"),
+    expected('"<parent>/<name>" of an element or attribute, inertia, or empty_limits'),
+]
 
 
 @dataclass(frozen=True)
@@ -116,13 +117,13 @@ class Robot:
             `plant.parameters`. And friction of joints.
     """
 
-    file: Annotated[str, ROBOT_FILE]
-    packages: dict[str, Annotated[str, FILE]] = field(default_factory=dict)
+    file: RobotFile
+    packages: dict[str, FileName] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
     base: RobotPlacement | None = None
     locked: dict[str, float] = field(default_factory=dict)
-    actuators: Annotated[Any, ACTUATORS] | None = None
-    leave_out: list[Annotated[str, LEFT_OUT]] = field(default_factory=list)
+    actuators: Actuators = None
+    leave_out: list[LeftOut] = field(default_factory=list)
     payloads: list[Payload] = field(default_factory=list)
     known_forces: list[Load] = field(default_factory=list)
 

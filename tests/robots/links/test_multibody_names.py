@@ -24,8 +24,7 @@ from random_plants import (
 )
 
 from drake_dae.errors import ModelError
-from drake_dae.robots import MultibodyExpressions
-from drake_dae.robots.links import multibody
+from drake_dae.robots import MultibodyExpressions, multibody
 
 URDF = """<robot name="crane">
   <link name="base"><inertial><mass value="3"/>

@@ -20,8 +20,10 @@ from drake_dae.robots import (
     ImplicitSurface,
     MeasuredSurface,
     Plane,
+    PointOnSurface,
     Sphere,
     Surface,
+    SurfaceCoordinates,
     Torus,
 )
 from drake_dae.trace.functions import TracedFunction
@@ -217,7 +219,10 @@ def test_distance_from_a_torus_is_that_of_the_nearest_point():
         (lambda: Ellipsoid((0, 0, 0), (1, 0, 1)), "semi_axes"),
         (lambda: Torus((0, 0, 0), (0, 0, 1), 0.2, 0.3), "minor_radius"),
         (lambda: ImplicitSurface(lambda p: p).distance(ca.SX.sym("p", 3)), r"\(3, 1\)"),
-        (lambda: ImplicitSurface(lambda p: p[0]).coordinates(ca.SX.sym("p", 3)), "ImplicitSurface"),
+        (
+            lambda: SurfaceCoordinates(PointOnSurface("tool", ImplicitSurface("x"), name="wall")),
+            "'wall'",
+        ),
     ],
 )
 def test_refusals(make, message):
