@@ -28,16 +28,15 @@ from drake_dae.dae import (
     with_disturbance,
 )
 from drake_dae.dae.disturbance import estimated_within
-from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop, wire_loop
 from drake_dae.diagrams.parts import (
     ENCODER_NOISE,
     LoopSettings,
     encoder_seed,
-    hold_before,
+    hold_sampling,
     make_sensor,
 )
 from drake_dae.diagrams.record import Record, RecordAfter
-from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import (
     AssumptionError,
     DrakeDaeError,
@@ -200,7 +199,7 @@ def build_completed(
     period = settings.period(plant.time_step)
     if settings.sampling is not None:
         with at("sampling"):
-            hold_before(plant, settings.sampling)
+            hold_sampling(plant, settings.sampling)
     if settings.encoders is not None:
         with at("sensors.encoders"):
             make_sensor(plant, settings.encoders, period)

@@ -127,6 +127,7 @@ def in_folder(name: str, info: pydantic.ValidationInfo) -> str:
 
 _TWO, _THREE = (pydantic.Field(min_length=size, max_length=size) for size in (2, 3))
 _TUPLE = pydantic.AfterValidator(tuple)
+Positive = Annotated[float, pydantic.Field(gt=0.0)]
 FileName = Annotated[str, pydantic.AfterValidator(in_folder), expected("the name of a file")]
 INTERVAL = "a lowest and a highest value, each a number or a list of numbers"
 Interval = Annotated[list[float | list[float]], _TWO, expected(INTERVAL)]

@@ -39,10 +39,9 @@ from drake_dae.robots import (
 )
 from drake_dae.scenario.completion import Completed, completions
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.parts import make
 from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
 from drake_dae.scenario.robot_file.robot import Payload
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, make
 from drake_dae.scenario.start import start_guess, start_state
 
 T = TypeVar("T")

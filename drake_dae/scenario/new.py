@@ -50,13 +50,7 @@ from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
 from drake_dae.scenario.robot_file.changes import joints_of
-from drake_dae.scenario.robot_file.reading import (
-    RobotLinks,
-    finalize,
-    needs_of,
-    read_robot,
-    robot_links,
-)
+from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
@@ -132,18 +126,6 @@ def new_scenario(
         ScenarioError: The file cannot be read or has no such tip, or no place is reached; the
             message lists the places that were tried.
     """
-    return placed_scenario(file, surface, tip, point, folder, progress)[:2]
-
-
-def placed_scenario(
-    file: str,
-    kind: SurfaceKind,
-    tip: str,
-    point: Vector,
-    folder: str | Path | None,
-    progress: Callable[[str], object],
-) -> tuple[Scenario, str, RobotLinks]:
-    """What `new_scenario` returns, and its robot as read."""
     progress("reading the robot")
     end = process_time() + _SECONDS
     is_url = file.startswith("package://")
@@ -162,7 +144,7 @@ def placed_scenario(
         is_done = found and (found[-1][0] >= _ENOUGH or count % len(places) == 0)
         if is_done or ((found or tried) and process_time() > end):
             break
-        scenario = _scenario(robot, tip, point, place, kind, fraction)
+        scenario = _scenario(robot, tip, point, place, surface, fraction)
         name = f"{scenario.constraints[0].name} at {place.center} m"
         progress(f"trying a {name}")
         try:
@@ -176,12 +158,12 @@ def placed_scenario(
             found.append((completed.critical_friction, scenario, place.why))
     if found:
         _, scenario, why["surface"] = max(found, key=lambda entry: entry[0])
-        return scenario, _text(scenario, why, folder), read
+        return scenario, _text(scenario, why, folder)
     joints = ", ".join(signal.name for signal in links.position_signals)
     where = "; ".join(tried[:_PLACES]) or "surfaces along all axes of the world"
     text = (
-        f"no place was found where the joints of '{tip}' ({joints}) move it along a {kind}. Tried: "
-        f"{where}. Give another tip, as --tip LINK:x,y,z, or copy a shipped scenario"
+        f"no place was found where the joints of '{tip}' ({joints}) move it along a {surface}. "
+        f"Tried: {where}. Give another tip, as --tip LINK:x,y,z, or copy a shipped scenario"
     )
     raise ScenarioError(("robot.file", text))
 
