@@ -197,12 +197,12 @@ class Equilibria:
         """Returns R with the outputs of a state and zero derivatives."""
         layout, scale = self.pinned.layout, self.pinned.system.scale
         reference = np.zeros(layout.reference_size)
-        chain = self.pinned.at(reference, parameters).residual(state)[-layout.chain_size :]
+        chain = PinnedSet(self.pinned, reference, parameters).residual(state)[-layout.chain_size :]
         if layout.chain_size:
             reference[layout.lowest[layout.dynamic]] = chain[layout.heads]
         direct = layout.lowest[layout.direct]
         if direct.size and not self._clocks.any():
-            pinned = self.pinned.at(reference, parameters)
+            pinned = PinnedSet(self.pinned, reference, parameters)
             still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
             slopes, rate = pinned.slopes(state, still, by), pinned.rate(state)
             if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):

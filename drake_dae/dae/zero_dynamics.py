@@ -8,7 +8,7 @@ on the choice of xi in (22).
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,14 +34,6 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 
 
-class Exogenous(Protocol):
-    """A `Reference` of an exogenous signal."""
-
-    @property
-    def size(self) -> int: ...
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]: ...
-
-
 @checked(ModelError)
 class ZeroDynamics:
     """The dynamics (35) that remain if the outputs are pinned to a reference.
@@ -61,7 +53,7 @@ class ZeroDynamics:
     """
 
     def __init__(self, system: DaeSystem, *, structure: Structure | None = None) -> None:
-        self.structure = structure = structure_of("ZeroDynamics", system, structure, find_structure)
+        self.structure = structure = structure_of(system, structure, find_structure)
         self.system = system
         self.dimension = structure.zero_dynamics_dimension
         self._pinned = PinnedOutputs(structure)
@@ -84,7 +76,7 @@ class ZeroDynamics:
             InconsistentStateError: Newton's method does not reach Z(R) from there.
         """
         goal = self._vector("reference", reference, self._pinned.layout.reference_size)
-        pinned = self._pinned.at(goal, self.system.parameter_vector(parameters))
+        pinned = PinnedSet(self._pinned, goal, self.system.parameter_vector(parameters))
         return pinned.state(self._guess(guess))
 
     @checked(ModelError)
@@ -94,7 +86,7 @@ class ZeroDynamics:
         times: ArrayLike,
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
-        exogenous: Sequence[Exogenous] = (),
+        exogenous: Sequence[Any] = (),
     ) -> PinnedMotion:
         """Computes the motion on Z(R(t)) from a state close to the guess, until it ends.
 
@@ -231,7 +223,7 @@ class ZeroDynamics:
         motion: PinnedMotion,
         period: float,
         parameters: ArrayLike | None = None,
-        exogenous: Sequence[Exogenous] = (),
+        exogenous: Sequence[Any] = (),
     ) -> StabilityAlong:
         """Judges by Floquet multipliers whether Assumption 2.2 holds along a periodic reference.
 
@@ -256,7 +248,7 @@ class ZeroDynamics:
         return PeriodicMotions(at, self._equilibria.sizes, period).judge(motion)
 
     def _moving(
-        self, parameters: FloatArray, exogenous: Sequence[Exogenous]
+        self, parameters: FloatArray, exogenous: Sequence[Any]
     ) -> Callable[[float], FloatArray]:
         """Returns the function t -> values of all parameters."""
         if not exogenous:
@@ -302,4 +294,4 @@ class ZeroDynamics:
         else:
             values = self._vector("outputs", outputs, self.system.num_outputs)
             goal = self._pinned.layout.constant(values)
-        return self._pinned.at(goal, parameters)
+        return PinnedSet(self._pinned, goal, parameters)

@@ -27,9 +27,8 @@ from drake_dae.robots import (
     plant_constraints,
 )
 from drake_dae.scenario.form import at
-from drake_dae.scenario.parts import TiltFromNormalForm, WrittenOutput, make
 from drake_dae.scenario.postures import INDEPENDENT, Posture, Postures, tool_axis
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, TiltFromNormalForm, WrittenOutput, make
 
 BEFORE = 0.02
 """The distance in m from its surface at which a task without start.positions begins."""

@@ -48,8 +48,13 @@ from drake_dae.scenario.form import at, dump_yaml
 from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
-from drake_dae.scenario.robot_file.changes import joints_of
-from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot, robot_links
+from drake_dae.scenario.robot_file.reading import (
+    finalize,
+    joints_of,
+    needs_of,
+    read_robot,
+    robot_links,
+)
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
@@ -183,10 +188,9 @@ def _read(file: str) -> tuple[MultibodyPlant, Robot]:
             if any(map(_has_room, joints_of(plant))):
                 break
     if loops:
-        names = ", ".join(loop.options["name"] for loop in loops)
         raise ModelError(
-            f"joints close loops ({names}), and a new scenario has none; write one by hand, as the "
-            "shipped five_bar"
+            f"joints close loops ({', '.join(loops)}), and a new scenario has none; write one by "
+            "hand, as the shipped five_bar"
         )
     finalize(plant)
     return plant, robot

@@ -13,8 +13,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 import drake_dae as dd
+from drake_dae.diagrams.closed_loop import log_steps
 from drake_dae.diagrams.record import Record
-from drake_dae.diagrams.wiring import log_steps
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.shipped import find_scenario
