@@ -47,8 +47,8 @@ from drake_dae.scenario.model import (
 )
 from drake_dae.scenario.scenario import Scenario
 
-# The least number of examined times along a reference, the most along a fast one, and the most times
-# of a record at which its references are examined.
+# The least number of examined times along a reference, the most along a fast one, and the most of a
+# record at which its references are examined.
 SAMPLES, MOST_SAMPLES, MOST_TIMES = 1001, 20_000, 2000
 # The allowed deviation of a reference from linear interpolation between two times, relative to its
 # range; the shortest interval that is divided, relative to the whole; and the share of a run that
