@@ -65,13 +65,12 @@ from drake_dae.systems.plant import Plant
 from drake_dae.systems.sensors import ForceSensor
 from drake_dae.systems.task_controller import TaskController
 
+# The rows of a record under error control, after the first; and the most rows of fixed steps: a
+# larger record takes gigabytes.
 ROWS, MOST_ROWS = 1000, 1e7
-"""The number of rows of a record under error control, after the first; and the largest number of
-rows of fixed steps, since a larger record takes gigabytes."""
-
+# The time by the clock in s between checks of a running rollout for divergence; and the fraction of
+# a step within which two times are equal.
 PERIOD, SAME = 0.2, 1e-6
-"""The time by the clock in s between checks of a running rollout for divergence; and the fraction
-of a step within which two times are equal."""
 
 
 @checked(lambda text: ScenarioError(("", text)))

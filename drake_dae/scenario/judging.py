@@ -47,17 +47,15 @@ from drake_dae.scenario.model import (
 )
 from drake_dae.scenario.scenario import Scenario
 
+# The least number of examined times along a reference, the most along a fast one, and the most of a
+# record at which its references are examined.
 SAMPLES, MOST_SAMPLES, MOST_TIMES = 1001, 20_000, 2000
-"""The smallest number of examined times along a reference, the largest along a fast one, and the
-most times of a record at which its references are examined."""
-
+# The allowed deviation of a reference from linear interpolation between two times, relative to its
+# range; the shortest interval that is divided, relative to the whole; and the share of a run that
+# broke off, at its end, in which its limits are not judged.
 STRAIGHT, SHORTEST, BREAK = 0.01, 1e-6, 0.01
-"""The allowed deviation of a reference from linear interpolation between two times, relative to its
-range; the shortest interval that is divided, relative to the whole; and the share of a run that
-broke off, at its end, in which its limits are not judged."""
-
+# The remedy for a link behind a surface.
 WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
-"""The remedy for a link behind a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,13 +189,10 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
 def sample_times(
     reference: Callable[[float], FloatArray], begin: float, end: float
 ) -> tuple[FloatArray, bool]:
-    """Sample times between which a reference is nearly linear.
-
-    Equidistant times would miss a sinusoid whose period is the interval. Each interval is tested at
-    a random time and divided if the reference is not linear there, until no interval is divided.
-    """
-    random = np.random.default_rng(0)
-    times = np.linspace(begin, end, SAMPLES)
+    """Sample times between which a reference is nearly linear, and whether there are enough."""
+    # Equidistant times would miss a sinusoid whose period is the interval. Each interval is tested
+    # at a random time, and divided if the reference is not linear there.
+    random, times = np.random.default_rng(0), np.linspace(begin, end, SAMPLES)
     values = np.array([reference(time) for time in times])
     while True:
         share = random.uniform(0.3, 0.7, times.size - 1)
