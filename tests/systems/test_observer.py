@@ -35,7 +35,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.dae import ConstraintStructure, with_disturbance
-from drake_dae.dae.disturbance import shares
+from drake_dae.dae.disturbance import orthogonal_part, shares
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems import Observing
