@@ -135,11 +135,6 @@ class Plant(System):
     def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
         """Refuses a start of a run that is not valid, for these values of all parameters."""
 
-    @property
-    def port_signals(self) -> dict[str, tuple[Signal, ...]]:
-        """Name of an output port of rule 1 -> names and units of its entries."""
-        return port_signals(self.structure)
-
     def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         """Adds the plant's own part of the Meshcat view, with its wires, to its diagram."""
 

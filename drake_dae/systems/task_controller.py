@@ -23,13 +23,7 @@ from drake_dae.systems.automaton import (
     SUCCESS,
     Automaton,
 )
-from drake_dae.systems.controller import (
-    Compared,
-    Controller,
-    Derived,
-    PhaseChange,
-    check_same_sizes,
-)
+from drake_dae.systems.controller import Compared, Controller, Derived, PhaseChange, check_law
 from drake_dae.systems.opening_contact import opening_contact
 from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plant import Plant
@@ -133,7 +127,7 @@ class TaskController(ParameterizedSystem, Controller):
         return np.array(self._values(context)[: self.law.all_parameters().size])
 
     def check_plant(self, plant: Plant) -> None:
-        check_same_sizes(plant.dae, self.law.system, "task", "the laws for the plant's robot")
+        check_law(plant.dae, self.law)
         if plant.is_ideal:
             raise WiringError(
                 "a task needs a contact that opens, and constraints of this plant hold exactly: "
