@@ -334,9 +334,8 @@ def wire_loop(
     if moving is not None:
         signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         inputs["exogenous"] = (moving.get_output_port(), signals)
-    inputs |= {
-        name: (plant.GetOutputPort(name), s) for name, s in port_signals(plant.structure).items()
-    }
+    own = port_signals(plant.structure)
+    inputs |= {name: (plant.GetOutputPort(name), s) for name, s in own.items()}
     if reference is not None:
         inputs["reference"] = (goal, controller.law.reference_signals)
     named = {**inputs, "control": (control, dae.control_signals), **named}
