@@ -27,8 +27,7 @@ from drake_dae.systems.contact_laws import (
 )
 from drake_dae.systems.contact_material import FRICTION, PointMaterial
 from drake_dae.systems.ideal_plants import joint_outputs
-from drake_dae.systems.parameterized import ParameterizedSystem, changed_parameters
-from drake_dae.systems.plant import Plant, port_signals
+from drake_dae.systems.plant import ParameterizedSystem, Plant, changed_parameters, port_signals
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import FailureKind, TracedFunction
 

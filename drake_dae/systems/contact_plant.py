@@ -57,8 +57,7 @@ from drake_dae.systems.contact_forces import (
 )
 from drake_dae.systems.contact_laws import ball_normals, contact_force_signals, touching
 from drake_dae.systems.contact_material import ContactMaterial
-from drake_dae.systems.parameterized import changed_parameters
-from drake_dae.systems.plant import Plant
+from drake_dae.systems.plant import Plant, changed_parameters
 
 
 def _is_relevant(record: logging.LogRecord) -> bool:

@@ -26,8 +26,7 @@ from drake_dae.dae import (
     ZeroDynamics,
 )
 from drake_dae.errors import ModelError, NonMinimumPhaseWarning, WiringError
-from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plant import NOWHERE, Plant
+from drake_dae.systems.plant import NOWHERE, ParameterizedSystem, Plant
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System

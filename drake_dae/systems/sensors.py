@@ -95,7 +95,8 @@ class StateSensor(TracedSystem):
 
     The measurement of t_k = k period is held until the next sample; at t_k itself the output is a
     function of the state at that instant, which a law sampled then uses. Entries of x after q and v
-    are not changed.
+    are not changed. The output has the name of the input of Drake's controllers that it goes to,
+    `estimated_state`, although nothing is estimated here: a StateEstimator has the same port.
     """
 
     __slots__ = SHARED_DICTIONARY
