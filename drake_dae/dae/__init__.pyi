@@ -48,9 +48,9 @@ from .stability import StabilityAlong as StabilityAlong
 from .stability import Verdict as Verdict
 from .structure import ConstraintStructure as ConstraintStructure
 from .structure import Structure as Structure
-from .structure import constraint_structure_of as constraint_structure_of
 from .structure import find_constraint_structure as find_constraint_structure
 from .structure import find_structure as find_structure
+from .structure import structure_of as structure_of
 from .structure import why_no_law as why_no_law
 from .system import DaeSystem as DaeSystem
 from .tracking import TrackingLaw as TrackingLaw

@@ -11,7 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.manifold import coordinates
 from drake_dae.dae.signals import Indices, Signal
-from drake_dae.dae.structure import ConstraintStructure, constraint_structure_of
+from drake_dae.dae.structure import ConstraintStructure, find_constraint_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.numerics import equilibration
@@ -81,7 +81,7 @@ def linearize(
         InconsistentStateError: The state is not on N*.
         ModelError: A shape is wrong, a number is not finite, or A(x) is singular at the state.
     """
-    structure, p = constraint_structure_of("linearize", system, structure), system.num_controls
+    structure, p = (structure_of(system, structure, find_constraint_structure), system.num_controls)
     u = np.zeros(p) if control is None else vector(f"{system.name}: control", control, p)
     values, manifold = system.parameter_vector(parameters), structure.manifold
     x = system.state_vector(structure.states[0] if state is None else state)

@@ -59,7 +59,7 @@ class NormalForm:
         *,
         structure: Structure | None = None,
     ) -> None:
-        structure = structure_of("NormalForm", system, structure, find_structure)
+        structure = structure_of(system, structure, find_structure)
         self.structure, self.system = structure, system
         if structure.control_margin.is_singular:
             raise ModelError(

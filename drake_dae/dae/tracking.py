@@ -74,7 +74,7 @@ class TrackingLaw:
         contact_stiffness: float | None = None,
         latency: float = 0.0,
     ) -> None:
-        self.structure = structure_of("TrackingLaw", system, structure, find_structure)
+        self.structure = structure_of(system, structure, find_structure)
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:

@@ -242,7 +242,10 @@ def wire_loop(
     named = Named()
 
     def connect(source: OutputPort, system: System, port: str) -> None:
-        builder.Connect(source, system.GetInputPort(port))
+        try:
+            builder.Connect(source, system.GetInputPort(port))
+        except RuntimeError as error:  # Drake names both systems and their sizes.
+            raise WiringError(str(error)) from None
 
     # The plant, its references and its controller.
     for block in (plant, reference, controller):
@@ -355,7 +358,10 @@ def wire_loop(
         source = moving.get_output_port() if moving is not None else None
         add_live_view(builder, plant, scene_graph, meshcat, source)
 
-    diagram = builder.Build()
+    try:
+        diagram = builder.Build()
+    except RuntimeError as error:  # An algebraic loop, or a block of another diagram, by name.
+        raise WiringError(str(error)) from None
     diagram.set_name("closed_loop")
     return ClosedLoop(
         diagram,

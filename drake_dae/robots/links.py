@@ -54,12 +54,11 @@ class Application:
     moment_axes: ca.SX  # N m for a unit of each lambda, shape (3, m).
     frame_b: str
     frame_a: str = "world"
-    drag: ca.SX | None = None  # The part of F without constraint forces, N, shape (3, 1).
+    drag: ca.SX = field(default_factory=lambda: ca.SX(3, 1))  # N, shape (3, 1).
 
     def force(self, constraint_force: ca.SX) -> ca.SX:
         """F in N, shape (3, 1), for constraint forces of shape (m, 1)."""
-        force = ca.mtimes(self.force_axes, constraint_force)
-        return force if self.drag is None else force + self.drag
+        return ca.mtimes(self.force_axes, constraint_force) + self.drag
 
 
 @dataclass(frozen=True, eq=False)

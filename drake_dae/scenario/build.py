@@ -12,21 +12,13 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context
 
+from drake_dae import dae
 from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.blocks.block import NOTHING, Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae import (
-    ConstraintStructure,
-    DaeSystem,
-    Structure,
-    TrackingLaw,
-    find_constraint_structure,
-    find_structure,
-    places_of,
-    with_disturbance,
-)
+from drake_dae.dae import ConstraintStructure, DaeSystem, Structure, TrackingLaw
 from drake_dae.dae.disturbance import estimated_within
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop, wire_loop
 from drake_dae.diagrams.parts import (
@@ -73,13 +65,12 @@ from drake_dae.systems.sensors import ForceSensor
 from drake_dae.systems.task import open_contact
 from drake_dae.systems.task_controller import TaskController
 
+# The rows of a record under error control, after the first; and the most rows of fixed steps: a
+# larger record takes gigabytes.
 ROWS, MOST_ROWS = 1000, 1e7
-"""The number of rows of a record under error control, after the first; and the largest number of
-rows of fixed steps, since a larger record takes gigabytes."""
-
+# The time by the clock in s between checks of a running rollout for divergence; and the fraction of
+# a step within which two times are equal.
 PERIOD, SAME = 0.2, 1e-6
-"""The time by the clock in s between checks of a running rollout for divergence; and the fraction
-of a step within which two times are equal."""
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -118,7 +109,7 @@ def build_completed(
         for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
             if getattr(scenario, key):
                 raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
-        free = find_constraint_structure(model.dae)
+        free = dae.find_constraint_structure(model.dae)
         plant = make_plant(completed.scenario, model, free)
         return completed, wire_loop(plant, _NoController(free), **drawn)
     if structure is None:
@@ -204,7 +195,7 @@ def build_completed(
         with at("sensors.encoders"):
             make_sensor(plant, settings.encoders, period)
     with at("judgement.tolerances"):
-        places_of("output", scenario.judgement.tolerances, model.dae.output_signals)
+        dae.places_of("output", scenario.judgement.tolerances, model.dae.output_signals)
 
     # The controller and the loop: with a task the law in contact, and one with the contact open.
     if task is not None:
@@ -212,7 +203,7 @@ def build_completed(
         assert gains is not None  # advised.
         names = [signal.name for point in points for signal in point.force_signals]
         with at("task.gains" if task.gains else "law.gains"):
-            free = find_structure(open_contact(law.system, names))
+            free = dae.find_structure(open_contact(law.system, names))
             of_free = TrackingLaw(free.system, gains.design(), structure=free, latency=law.latency)
         with at("task"):
             # The noise of the sum over the points.
@@ -253,12 +244,12 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             raise ScenarioError(("estimator", text + rough * name.endswith(".friction")))
         with at("estimator.parameters"):
             velocities = [signal.name for signal in model.links.velocity_signals]
-            observed = with_disturbance(model.dae, velocities, names)
+            observed = dae.with_disturbance(model.dae, velocities, names)
             friction = {contact.friction for contact in model.dae.contacts}
             others = [p for p in model.dae.parameters if p.name in {*names} - friction]
             estimated_within(others, estimator.ranges)
         with at("estimator"):
-            structure = find_structure(observed)
+            structure = dae.find_structure(observed)
     # The mean time from a sample to the moment when its control acts, for rigid joints. A plant
     # that steps by h damps with the speed at the end of each step: h / 2 later than the mean, and h
     # later than a law without sampling, which acts at each step.

@@ -29,20 +29,12 @@ from drake_dae.systems.automaton import SMOOTH, fading
 from drake_dae.systems.phases import Approach, Press
 from drake_dae.systems.sensors import Encoders
 
-PATCH_FORCE = 10.0
-"""The force in N at which the stiffness of a hydroelastic patch is evaluated."""
-
-_BEYOND = 2.0
-"""A run is reported whose errors exceed the stated ones by this factor."""
-
-_STATES = 33
-"""The number of states along the references at which friction is compared with what jams."""
-
-_DEVELOPED = 10.0
-"""The factor of velocities, so that friction of the model is that of a contact that slides."""
-
-_PERIODS = 3
-"""The number of oscillations of the contact after the force of a touch has reached its goal."""
+PATCH_FORCE = 10.0  # The force in N at which the stiffness of a hydroelastic patch is evaluated.
+_BEYOND = 2.0  # A run is reported whose errors exceed the stated ones by this factor.
+_PERIODS = 3  # The oscillations of the contact after the force of a touch has reached its goal.
+# The number of states along the references at which friction is compared with what jams; and the
+# factor of their velocities, so that friction of the model is that of a contact that slides.
+_STATES, _DEVELOPED = 33, 10.0
 
 
 def timing(scenario: Scenario) -> tuple[float, int]:
@@ -108,13 +100,10 @@ def sensed_contact(
 def stated_errors(
     scenario: Scenario, model: RobotModel, structure: Structure
 ) -> tuple[float, float] | None:
-    """The rms errors of a point in m and of a contact force in N by the linear model.
+    """The rms errors of a point in m and of a force in N by the linear model of `advised_gains`.
 
-    It is that of `advised_gains`, of one direction, with the gains as they run: with the noise of
-    the sensors, an unknown force of `MODEL_ERROR` that appears every `EVERY` seconds, a reference
-    of the force that changes by `RAMP`, and the bias of the force sensor, which no law knows.
-    None without an estimator on a contact that gives way, in a task, and where gains are no
-    coefficients of points and forces.
+    With the gains as they run, the noise of the sensors, an unknown force, a changing reference,
+    and the bias of the force sensor, which no law knows. None where that model says nothing.
     """
     law, estimator, material = scenario.law, scenario.estimator, scenario.plant.material
     if material is None or scenario.task is not None or not timing(scenario)[0]:

@@ -26,48 +26,22 @@ from drake_dae.scenario.expected import (
 from drake_dae.scenario.form import at
 from drake_dae.scenario.model import references_of
 from drake_dae.scenario.robot_file.robot import Payload
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, WrittenConstraint
 from drake_dae.scenario.start import opening_contact
 
-_SOFTER = 5.0
-"""The ratio of the poles of positions to those of the distance, of a robot without contact."""
-
-NOISE = 1e-3
-"""The standard deviation of velocity noise in rad/s, without encoders."""
-
-_SHARE = 0.003
-"""The default of the largest roughness, as a fraction of the largest effort limit."""
-
-
-LEAST_MASS = 1e-6
-"""The mass in kg of a load that nobody has stated; masses are positive."""
-
-_LOAD, _TILT, _COULOMB, _VISCOUS = 0.2, 0.15, 0.1, 0.25
-"""The largest load relative to the robot's mass, the largest tilt in rad, and the largest friction
-of a joint in N m, and in N m per rad/s, relative to its largest effort."""
-
-_PLACE = 0.01
-"""The largest displacement of a plane in m."""
-
-_CENTER = 0.2
-"""The largest distance of a load from its frame's origin, in m."""
-
-_EFFORT = 100.0
-"""The largest effort in N m of drives without limits in the file."""
+_SOFTER = 5.0  # The ratio of the poles of positions to those of the distance, without contact.
+NOISE = 1e-3  # The standard deviation of velocity noise in rad/s, without encoders.
+_SHARE = 0.003  # The default of the largest roughness, as a fraction of the largest effort limit.
+LEAST_MASS = 1e-6  # The mass in kg of a load that nobody has stated; masses are positive.
+_EFFORT = 100.0  # The largest effort in N m of drives without limits in the file.
+# The largest load relative to the robot's mass, and its largest distance from its frame in m; the
+# largest tilt in rad and displacement in m of a plane; and the largest friction of a joint in N m,
+# and in N m per rad/s, relative to its largest effort.
+_LOAD, _CENTER, _TILT, _PLACE, _COULOMB, _VISCOUS = 0.2, 0.2, 0.15, 0.01, 0.1, 0.25
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
-    """The gains and other settings that a scenario on contact that gives way leaves out.
-
-    These are gains, integrals of forces and of points, constraint damping, an estimator, and
-    measured force, each if it is left out; and for a task the gains without contact, soft along the
-    distance. With encoders and rigid joints the gains are those of `advised_gains`; otherwise those
-    of `contact_gains`. A scenario with `law.gains`, or with ideal contact, is unchanged.
-
-    Raises:
-        ScenarioError: There are no default gains for such a scenario, or none are smooth and stable
-            enough; or `largest_roughness` or `largest_errors` is given and not used.
-    """
+    """The scenario with gains of `advised_gains` or `contact_gains`, and what belongs to them."""
     material, law, sensors = scenario.plant.material, scenario.law, scenario.sensors
     for name in ("largest_roughness", "largest_errors"):
         is_used = scenario.is_advised and sensors.encoders is not None
@@ -208,22 +182,18 @@ def _sensed_gains(
 
 
 def _fed_ahead(scenario: Scenario, structure: Structure, stiffness: float) -> float | None:
-    """The stiffness by which the deflection of contacts is fed ahead, if the references allow it.
-
-    All constraint forces are outputs then, with references that have two derivatives.
-    """
+    """The stiffness by which the deflection of contacts is fed ahead, if references allow it."""
     system, given = structure.system, scenario.law.contact_stiffness
     if given is not None or scenario.task is not None:
         return given
-    names, degrees = [s.name for s in system.output_signals], list(structure.output_degrees)
-    forces = [s.name for s in system.constraint_input_signals]
-    of_forces = [i for i, name in enumerate(names) if name in forces]
-    is_fit = len(of_forces) == len(forces) and {*structure.constraint_degrees} == {2}
-    if not is_fit or any(degrees[i] for i in of_forces):
+    # All constraint forces are outputs then, with references that have two derivatives.
+    names = [signal.name for signal in system.output_signals]
+    forces = [signal.name for signal in system.constraint_input_signals]
+    degrees = dict(zip(names, structure.output_degrees, strict=True))
+    if {*structure.constraint_degrees} != {2} or any(degrees.get(name, 1) for name in forces):
         return None
-    degrees = [2 if i in of_forces else degree for i, degree in enumerate(degrees)]
     try:
-        references_of(scenario, names, degrees)
+        references_of(scenario, names, [*(degrees | dict.fromkeys(forces, 2)).values()])
     except ScenarioError:
         return None
     return rounded(stiffness)
@@ -248,19 +218,12 @@ def with_friction_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
 
 
 def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
-    """The scenario of a law whose estimator knows loads, places of planes, and friction.
-
-    A load is at each frame in contact, a mass and its place; the friction is that of contacts, and
-    Coulomb and viscous friction of all driven joints. Their bounds, from which their estimation
-    starts, follow from masses and efforts of the robot's file.
-    """
+    """The scenario of a law whose estimator knows a load at each contact, planes and friction."""
     assert scenario.estimator is not None
-    robot, frictional = scenario.robot, list[str]()
-    ranges: dict[str, float] = {}
-    loads: dict[str, Payload] = {}
+    robot, frictional, constraints = scenario.robot, list[str](), list[WrittenConstraint]()
+    ranges, loads = dict[str, float](), dict[str, Payload]()
     known = {p.name for p in model.dae.parameters}
     masses = [p.value[0] for p in model.dae.parameters if p.name.endswith(".mass")]
-    constraints = []
     for constraint in scenario.constraints:
         if isinstance(constraint, PointOnSurface):
             constraint = replace(constraint, friction=constraint.friction or 0.0)
@@ -276,16 +239,16 @@ def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
                 ranges[f"{name}.center"] = _CENTER
         constraints.append(constraint)
     # An effort that the file does not limit is taken for the largest one that it does.
-    names_of_joints = [signal.name for signal in model.links.position_signals]
+    names = [signal.name for signal in model.links.position_signals]
     efforts = np.where(np.isfinite(model.control_limits), model.control_limits, 0.0)
     largest = float(np.max(efforts, initial=0.0)) or _EFFORT
     efforts = np.where(efforts > 0.0, efforts, largest)
-    if efforts.size != len(names_of_joints):
-        efforts = np.full(len(names_of_joints), largest)
-    joints = [joint for joint in names_of_joints if f"{joint}.coulomb" not in known]
-    for joint, effort in zip(names_of_joints, efforts.tolist(), strict=True):
+    if efforts.size != len(names):
+        efforts = np.full(len(names), largest)
+    for joint, effort in zip(names, efforts.tolist(), strict=True):
         ranges[f"{joint}.coulomb"] = _COULOMB * effort
         ranges[f"{joint}.viscous"] = _VISCOUS * effort
+    joints = [joint for joint in names if f"{joint}.coulomb" not in known]
     forces = [*robot.known_forces, *([JointFriction(joints)] if joints else [])]
     return replace(
         scenario,

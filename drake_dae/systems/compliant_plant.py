@@ -13,7 +13,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import Block, Held, Requirement, stacked
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae import ConstraintStructure, Signal, constraint_structure_of
+from drake_dae.dae import ConstraintStructure, Signal, find_constraint_structure, structure_of
 from drake_dae.errors import ModelError
 from drake_dae.robots import RobotModel
 from drake_dae.systems.contact_laws import (
@@ -96,7 +96,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
         dae, count = model.dae, len(model.constraints)
         values = dae.parameter_vector(changed_parameters(model, parameters or {}))
         self.model: RobotModel = model
-        self.structure = constraint_structure_of(type(self).__name__, dae, structure)
+        self.structure = structure_of(dae, structure, find_constraint_structure)
         self.time_step, self.material = material.time_step, material
         self._checked_step = np.zeros(0)
         numbers, normals = ca.SX.sym("material", 4), ca.SX.sym("normals", 3 * count)

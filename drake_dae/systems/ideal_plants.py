@@ -17,7 +17,13 @@ from drake_dae.blocks.failures import (
     singular_configuration,
 )
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.dae import ConstraintStructure, DaeSystem, Signal, constraint_structure_of
+from drake_dae.dae import (
+    ConstraintStructure,
+    DaeSystem,
+    Signal,
+    find_constraint_structure,
+    structure_of,
+)
 from drake_dae.dae.redundancy import manifold_of_left_out
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.robots import ConstraintSet, RobotModel
@@ -72,7 +78,7 @@ class DaePlant(ParameterizedSystem, Plant):
         structure: ConstraintStructure | None = None,
         project: bool = True,
     ) -> None:
-        structure = constraint_structure_of(type(self).__name__, system, structure)
+        structure = structure_of(system, structure, find_constraint_structure)
         self._start(structure, dae_block(structure, project))
 
     def _start(self, structure: ConstraintStructure, block: Block) -> None:
@@ -191,7 +197,7 @@ class RobotPlant(DaePlant):
         structure: ConstraintStructure | None = None,
         project: bool = True,
     ) -> None:
-        structure = constraint_structure_of(type(self).__name__, model.dae, structure)
+        structure = structure_of(model.dae, structure, find_constraint_structure)
         self.model: RobotModel = model
         self._start(structure, robot_block(model, structure, project))
 

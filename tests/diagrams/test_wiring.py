@@ -47,14 +47,14 @@ def test_a_sensor_that_no_law_uses_is_refused():
 
 
 def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
-    with pytest.raises(RuntimeError, match=r"two_link.*size 1.*force_sensor.*size 2"):
+    with pytest.raises(WiringError, match=r"two_link.*size 1.*force_sensor.*size 2"):
         rigid(dd.ForceSensor(2, time_constant=0.01))
 
 
 @pytest.mark.slow
 def test_a_plant_of_another_diagram_is_refused_with_its_name():
     loop, _ = dd.build_scenario(scenario("two_link_wall"))
-    with pytest.raises(RuntimeError, match="'two_link_arm'"):
+    with pytest.raises(WiringError, match="'two_link_arm'"):
         dd.make_closed_loop(loop.plant, loop.controller.law, loop.generator.references)
 
 

@@ -14,11 +14,15 @@ import numpy as np
 import pytest
 from arms import error_controlled
 from numpy.testing import assert_allclose
-from painleve import GRAVITY, HALF, MASS, critical, rod, sliding
 from runs import some
 
 from drake_dae import (
     ConstantReference,
+    JointPositions,
+    LinkExpressions,
+    Plane,
+    PointOnSurface,
+    RobotModel,
     RobotPlant,
     SinusoidReference,
     TrackingLaw,
@@ -31,6 +35,38 @@ from drake_dae.dae import Parameter, Signal, UnilateralInput
 from drake_dae.dae.contacts import Contacts, critical_factor
 from drake_dae.errors import PainleveError
 from drake_dae.trace.functions import TracedFunction
+
+MASS, HALF, GRAVITY, SPEED = 1.3, 0.5, 9.81, 1e-3
+
+
+def rod(friction, angle=1.0):
+    """A rod in the x-z plane with positions (x, z, angle), moved by a force and a torque."""
+    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
+    c, s = ca.cos(q[2]), ca.sin(q[2])
+    turned = ca.vertcat(ca.horzcat(c, 0, -s), ca.horzcat(0, 1, 0), ca.horzcat(s, 0, c))
+    links = LinkExpressions(
+        q,
+        v,
+        ca.diag(ca.SX([MASS, MASS, MASS * HALF**2 / 3.0])),
+        ca.SX([0.0, MASS * GRAVITY, 0.0]),
+        frames={"rod": (turned, ca.vertcat(q[0], 0.0, q[1]))},
+    )
+    floor = PointOnSurface(
+        "rod", Plane((0, 0, 0), (0, 0, 1)), (-HALF, 0, 0), "floor", None, friction, SPEED
+    )
+    nominal = [0.0, HALF * np.sin(angle), angle]
+    outputs = [JointPositions(["q0", "q2"])]
+    return RobotModel(links, [floor], outputs, nominal)
+
+
+def sliding(angle, turn=0.0):
+    """The rod's state, its end on the floor."""
+    height, rise = HALF * np.sin(angle), HALF * np.cos(angle) * turn
+    return np.array([0.0, height, angle, -2.0 - HALF * np.sin(angle) * turn, rise, turn])
+
+
+def critical(angle):
+    return (1.0 + 3.0 * np.cos(angle) ** 2) / (3.0 * np.sin(angle) * np.cos(angle))
 
 
 def margin_of(mu, angle):

@@ -1,23 +1,78 @@
-"""The depth of links behind a surface, against forward kinematics by hand."""
+"""Normals of contacts, and the depth of links behind a surface, against forward kinematics."""
 
 import numpy as np
 import pytest
+from arms import parse
+from members import FrictionalPoint
+from numpy.testing import assert_allclose
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
 from runs import scenario
 
 from drake_dae import (
     Cylinder,
     JointPositions,
     Plane,
+    PointCoordinates,
     PointOnSurface,
     RobotModel,
     Sphere,
     shipped_model,
 )
-from drake_dae.robots import MultibodyExpressions, links_behind
+from drake_dae.robots import (
+    ConstraintSet,
+    ConstraintWrenches,
+    MultibodyExpressions,
+    contact_normals,
+    links_behind,
+)
 from drake_dae.scenario.judging import find_feasibility
+
+
+def wall():
+    return PointOnSurface("tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")
+
+
+def rubbing_arm():
+    contact = FrictionalPoint("tool", wall().surface, name="wall", coefficient=0.3, speed=0.05)
+    plant = parse("two_link_arm")
+    outputs = [PointCoordinates("tool", "z")]
+    return RobotModel.from_multibody(plant, [contact], outputs, [1.2, -1.6])
+
+
+def sphere_arm():
+    contact = PointOnSurface("tool", Sphere((1.5, 0, 0.2), 0.4), name="ball")
+    outputs = [JointPositions(["joint1"])]
+    return RobotModel.from_multibody(parse("two_link_arm"), [contact], outputs, [1.2, -1.6])
+
+
+@pytest.mark.parametrize("make", [rubbing_arm, sphere_arm], ids=["friction", "sphere"])
+def test_normal_is_the_direction_in_which_the_residual_grows(make):
+    """n = d phi / d(point), the tool's row of the constraint's Jacobian by MultibodyPlant: phi'
+    is n . (J_point v) for any v, where friction does not enter; 1e-12 is round-off."""
+    model = make()
+    plant, rng = model.links.plant, np.random.default_rng(3)
+    own = plant.CreateDefaultContext()
+    normals, wrenches = contact_normals(model), ConstraintWrenches(model)
+    kinematics = model.links.kinematics()
+    rate = kinematics.value(ConstraintSet(model.constraints).rate(kinematics))
+    rates = model.dae.trace("rate", {"value": rate})
+    for _ in range(5):
+        state = rng.normal(size=model.dae.num_states)
+        plant.SetPositionsAndVelocities(own, state)
+        (normal,) = normals(state, model.dae.parameter_values)
+        (point,) = wrenches(state, [1.0]).points
+        body = plant.GetFrameByName(wrenches.frames[0])
+        seen = body.CalcPoseInWorld(own).inverse() @ point
+        world = plant.world_frame()
+        jacobian = plant.CalcJacobianTranslationalVelocity(
+            own, JacobianWrtVariable.kV, body, seen, world, world
+        )
+        moving = jacobian @ plant.GetVelocities(own)
+        assert_allclose(normal @ moving, rates(state, model.dae.parameter_values)[0], atol=1e-12)
+
 
 BASE, LENGTH, RADIUS, JOINTS = 0.3, 0.5, 0.06, 4
 TABLE = Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
