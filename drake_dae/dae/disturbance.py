@@ -174,7 +174,10 @@ class Observation:
         d = named[DISTURBANCE].symbol
         entry = ca.DM(ca.jacobian(system.f, d).sparsity()).full()
         rows = [int(np.flatnonzero(column)[0]) for column in entry.T]
-        frictions = _frictions(system, tuple(named))
+        # The exogenous coefficients of friction, and the constraint input of each.
+        inputs = [signal.name for signal in system.constraint_input_signals]
+        pressing = {c.friction: inputs.index(c.force) for c in system.contacts if c.friction}
+        frictions = {name: pressing[name] for name in named if name in pressing}
         others = tuple(p for p in named.values() if p.name not in (*frictions, DISTURBANCE))
         x, v = system.state, ca.SX.sym("v", system.num_constraints)
         u = ca.SX.sym("u", system.num_controls)
@@ -183,8 +186,8 @@ class Observation:
         still = ca.SX.sym("still", x.numel())
         moved = ca.jtimes(ca.mtimes(mass, still), x, _known_rate(system, mass, rows))
         drift = ca.substitute(system.f[rows], d, 0 * d) + ca.substitute(moved, still, x)
-        inputs = action[rows] + ca.mtimes(system.h[rows, :], u)
-        outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
+        pushed_by = action[rows] + ca.mtimes(system.h[rows, :], u)
+        outputs = {"momentum": momentum, "drift": drift, "inputs": pushed_by}
         signals = {"control": u, "constraint_input": v}
         function = system.trace("momentum", outputs, signals, often=False)
         identified = IdentifiedTerms.of(system, others, outputs, signals)
@@ -270,13 +273,6 @@ def _wanted(
     inputs = {"reference": reference, "ahead": ahead}
     wanted = system.trace("wanted velocities", {"state": state}, inputs, factors.pivot, often=False)
     return wanted, moving
-
-
-def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
-    """The exogenous coefficients of friction, and the constraint input of each."""
-    forces = [signal.name for signal in system.constraint_input_signals]
-    pressed_by = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
-    return {name: pressed_by[name] for name in names if name in pressed_by}
 
 
 def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
