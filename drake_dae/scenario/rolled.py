@@ -20,7 +20,7 @@ from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, Simulatio
 from drake_dae.pictures.page.controls import PUSH
 from drake_dae.references import ConstantReference
 from drake_dae.robots import KnownWrench, PointOnSurface
-from drake_dae.running.divergence import DivergenceWatch
+from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.robot_file.reading import robot_links
