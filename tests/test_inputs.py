@@ -28,9 +28,9 @@ from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
 from drake_dae.running import export_loop, start_values
+from drake_dae.scenario.form import load_yaml
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.typed_yaml import load_yaml
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)

@@ -1,5 +1,6 @@
 """A block stepped without a C compiler: the loop of stepper.c over CasADi's interpreter."""
 
+from functools import partial
 from math import ceil
 
 import numpy as np
@@ -9,12 +10,6 @@ from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepFunctions,
 from drake_dae.blocks.trials import LEAST_PROGRESS, PACE_STEPS
 from drake_dae.errors import InconsistentStateError
 
-REACHED, NEAR = 1e-8, 1e-5
-"""As in stepper.c."""
-
-LOOKED = 64
-"""The number of steps after which a run checks for Ctrl-C and divergence."""
-
 
 class _Ended(Exception):
     """The run cannot go on: its argument says why."""
@@ -22,7 +17,7 @@ class _Ended(Exception):
 
 def run_interpreted(functions: StepFunctions, problem: RunProblem, settings: StepSettings) -> Run:
     """Makes a run until its end, or to where it cannot go on."""
-    run, ending = InterpretedRun(functions, problem, settings), RunEnding.DONE
+    run, ending = _Interpreted(functions, problem, settings), RunEnding.DONE
     try:
         run.steps_to_end()
     except _Ended as ended:
@@ -32,7 +27,7 @@ def run_interpreted(functions: StepFunctions, problem: RunProblem, settings: Ste
     return Run(rows, ending, *at, run.trial_time, run.trial)
 
 
-class InterpretedRun:
+class _Interpreted:
     """A run under way; attributes as of `Run`."""
 
     def __init__(
@@ -41,164 +36,113 @@ class InterpretedRun:
         self.functions, self.problem, self.settings = functions, problem, settings
         self.state, self.held, self.rows = problem.state, problem.held, list[FloatArray]()
         self.start = self.time = self.mark = self.before = float(problem.times[0])
-        self.events, self.event, self.steps, self.is_on = problem.events, 0, 0, False
+        self.event, self.steps, self.is_on = 0, 0, False
         self.next, self.trial_time, self.trial = np.nan, np.inf, np.full(1, np.nan)
 
     def value(self, name: str, time: float, state: FloatArray) -> FloatArray:
         """The first result of a function, now; notes the earliest trial without a value."""
-        function = self.functions.buffered[name]
-        value = function(time, state, self.held, self.problem.parameters)[0].copy()
-        is_trial = time < self.trial_time and np.isfinite(state).all()
-        if is_trial and not np.isfinite(value).all():
+        given = time, state, self.held, self.problem.parameters
+        value = self.functions.buffered[name](*given)[0].copy()
+        if time < self.trial_time and np.isfinite(state).all() and not np.isfinite(value).all():
             self.trial_time, self.trial = time, np.array(state)
         return value
 
-    def rate(self, time: float, state: FloatArray) -> FloatArray:
-        return self.value("rate", time, state)
-
     def write(self, time: float, state: FloatArray) -> None:
-        """Adds a row of the record."""
-        row = self.value("row", time, state)
-        if not np.isfinite(row).all():
-            raise _Ended(RunEnding.INVALID)
-        self.rows.append(row)
+        self.rows.append(_valid(self.value("row", time, state)))
 
-    def newton(self, time: float, state: FloatArray) -> tuple[FloatArray, bool]:
-        """The state after Newton steps to the manifold; the state itself, and False, far away."""
-        found = state
-        for attempt in range(8 if self.functions.projects else 0):
-            held, parameters = self.held, self.problem.parameters
-            moved, left = self.functions.buffered["newton"](time, found, held, parameters)
-            found = moved.copy()
-            if left[0] <= REACHED:
-                return found, True
-            if attempt and not left[0] <= NEAR:
-                break
-        return state, not self.functions.projects
+    def projected(self, time: float, state: FloatArray) -> FloatArray:
+        """A state moved onto the manifold."""
+        try:
+            given = time, state, self.held, self.problem.parameters
+            return self.functions.projected(*given) if self.functions.projects else state
+        except InconsistentStateError:
+            raise _Ended(RunEnding.OFF_MANIFOLD) from None
 
     def project(self) -> None:
-        state, self.is_on = self.newton(self.time, self.state)
         if not self.is_on:
-            try:
-                parameters = self.problem.parameters
-                state = self.functions.projected(self.time, self.state, self.held, parameters)
-            except InconsistentStateError:
-                raise _Ended(RunEnding.OFF_MANIFOLD) from None
-        self.state, self.is_on = state, True
+            self.state, self.is_on = self.projected(self.time, self.state), True
 
     def update(self) -> bool:
         """Unrestricted updates, the projection, discrete updates; whether any were made."""
-        first = self.event
-        while True:
-            is_due = self.event < self.events.size and self.events[self.event] <= self.time
-            if is_due:
-                self.apply(True)
-            if not self.is_on:
+        first, events, problem = self.event, self.problem.events, self.problem
+        while self.event < events.size and events[self.event] <= self.time:
+            for is_unrestricted in (True, False):  # Those of one kind all at once.
+                held, noise = self.held.copy(), problem.noise[self.event]
+                given = self.time, self.state, self.held, problem.parameters, noise
+                for number, rate in enumerate(self.functions.rates):
+                    is_due = problem.due[self.event] >> number & 1
+                    if is_due and rate.is_unrestricted == is_unrestricted:
+                        (values,) = self.functions.buffered[f"update_{number}"](*given)
+                        held[rate.places] = _valid(values)
+                self.held = held
                 self.project()
-            if not is_due:
-                return self.event > first
-            self.apply(False)
             self.event += 1
-
-    def apply(self, is_unrestricted: bool) -> None:
-        """Makes the updates of one kind that are due, all at once."""
-        held, noise = self.held.copy(), self.problem.noise[self.event]
-        for number, rate in enumerate(self.functions.rates):
-            is_due = self.problem.due[self.event] >> number & 1
-            if not is_due or rate.is_unrestricted != is_unrestricted:
-                continue
-            given = self.time, self.state, self.held, self.problem.parameters, noise
-            (held[rate.places],) = self.functions.buffered[f"update_{number}"](*given)
-            if not np.isfinite(held[rate.places]).all():
-                raise _Ended(RunEnding.INVALID)
-        self.held = held
+        self.project()
+        return self.event > first
 
     def steps_to_end(self) -> None:
         """Steps from row to row and sample to sample, in the order of stepper.c."""
         from scipy.integrate import DOP853
 
-        times, row = self.problem.times, 0
-        is_fixed, plan = self.settings.tableau is not None, list[float]()
-        solver, tried, longest = None, None, self.settings.longest
-        while True:
-            at_row = self.time >= times[row]
-            if at_row and row == times.size - 1:
-                self.update()  # The last row comes after the updates of its time.
-                return self.write(self.time, self.state)
-            if at_row:
-                if not is_fixed and self.steps and not self.is_on:
-                    self.project()
+        times, events, settings = self.problem.times, self.problem.events, self.settings
+        rate, solver, tried = partial(self.value, "rate"), None, 0.0
+        while self.time < times[-1]:
+            if self.time >= times[len(self.rows)]:
                 self.write(self.time, self.state)
-                row += 1
-            if self.steps % LOOKED == 0 and self.settings.look(lambda: np.array(self.rows)):
-                raise _Ended(RunEnding.PAUSED)
-            was_on = self.is_on
-            if self.update() or not was_on:
-                solver = None
-            limit = float(times[row] if is_fixed else times[-1])
-            if self.event < self.events.size:
-                limit = min(limit, float(self.events[self.event]))
-            if solver is None:
-                rate = self.rate(self.time, self.state)
-                if not np.isfinite(rate).all():
-                    raise _Ended(RunEnding.INVALID)
-            if is_fixed:
-                if not plan:
-                    count = max(1, ceil((limit - self.time) / longest - 0.01))
-                    plan = [self.time + (limit - self.time) * (i / count) for i in range(1, count)]
-                    plan.append(limit)
-                self.fixed_step(plan.pop(0), rate)
+            solver = None if self.update() else solver
+            limit = float(times[-1] if settings.tableau is None else times[len(self.rows)])
+            limit = min(limit, *events[self.event : self.event + 1].tolist(), np.inf)
+            if settings.tableau is not None:
+                self.fixed_steps(limit, *settings.tableau)
                 continue
             if solver is None:
-                solver = DOP853(
-                    self.rate,
-                    self.time,
-                    self.state,
-                    limit,
-                    max_step=longest,
-                    rtol=self.settings.relative,
-                    atol=self.settings.absolute,
-                    first_step=None if tried is None else min(tried, limit - self.time),
-                )
+                _valid(rate(self.time, self.state))
+                first = min(tried, limit - self.time) or None
+                tolerances = settings.longest, settings.relative, settings.absolute
+                solver = DOP853(rate, self.time, self.state, limit, *tolerances, first_step=first)
             advised = solver.h_abs
             solver.step()
             if solver.status == "failed":
                 raise _Ended(RunEnding.STUCK)
-            reached, self.is_on = self.newton(solver.t, solver.y)
-            solver.y, solver.f = reached, self.rate(solver.t, reached)
-            if not np.isfinite(solver.f).all():
-                raise _Ended(RunEnding.INVALID)
-            solver.K[-1] = solver.f
-            if times[row] < solver.t:
-                between = solver.dense_output()
-            while times[row] < solver.t:
-                moment = float(times[row])
-                self.write(moment, self.newton(moment, between(moment))[0])
-                row += 1
             # A step that only ended early, at a sample, says nothing against longer ones.
             tried = max(solver.h_abs, advised if solver.t >= limit else 0.0)
-            self.accept(float(solver.t), reached)
+            self.accept(float(solver.t), solver.y)
+            self.project()
+            solver.y, solver.f = self.state, _valid(rate(self.time, self.state))
+            solver.K[-1] = solver.f
+            if times[len(self.rows)] < self.time:
+                between = solver.dense_output()
+            while (moment := float(times[len(self.rows)])) < self.time:
+                self.write(moment, self.projected(moment, between(moment)))
+        self.update()  # The last row comes after the updates of its time.
+        self.write(self.time, self.state)
 
-    def fixed_step(self, end: float, first: FloatArray) -> None:
-        tableau, step = self.settings.tableau, end - self.time
-        assert tableau is not None
-        rates = np.empty((tableau.c.size, self.state.size))
-        rates[0] = first
-        for i in range(1, tableau.c.size):
-            stage = self.state + step * (tableau.a[i, :i] @ rates[:i])
-            rates[i] = self.rate(self.time + float(tableau.c[i]) * step, stage)
-        reached = self.state + step * (tableau.b @ rates)
-        self.next = end
-        if not np.isfinite(reached).all():
-            raise _Ended(RunEnding.SPOILT)
-        self.is_on = False
-        self.accept(end, reached)
+    def fixed_steps(self, limit: float, a: FloatArray, b: FloatArray, c: FloatArray) -> None:
+        """Steps of equal lengths to a time, each by x + h (b k), k_i = x'(t + c_i h, x + h a k)."""
+        begin, rates = self.time, np.empty((c.size, self.state.size))
+        count = max(1, ceil((limit - begin) / self.settings.longest - 0.01))
+        for end in [*(begin + (limit - begin) * (i / count) for i in range(1, count)), limit]:
+            self.project()
+            h, rates[0] = end - self.time, _valid(self.value("rate", self.time, self.state))
+            for i in range(1, c.size):
+                stage = self.state + h * (a[i, :i] @ rates[:i])
+                rates[i] = self.value("rate", self.time + float(c[i]) * h, stage)
+            self.next = end
+            self.accept(end, _valid(self.state + h * (b @ rates), RunEnding.SPOILT))
 
     def accept(self, time: float, state: FloatArray) -> None:
-        """Accepts a step; ends the run where a thousand of them add hardly any time."""
-        self.time, self.state, self.steps = time, state, self.steps + 1
+        """Accepts a step. The run ends where a thousand add hardly any time, or by `look`."""
+        self.time, self.state, self.steps, self.is_on = time, state, self.steps + 1, False
         self.trial_time = np.inf
         if self.steps % PACE_STEPS == 0:
             self.before, self.mark = self.mark, time
             if time - self.before < LEAST_PROGRESS * (time - self.start):
                 raise _Ended(RunEnding.SLOW)
+        if self.steps % 64 == 0 and self.settings.look(lambda: np.array(self.rows)):
+            raise _Ended(RunEnding.PAUSED)
+
+
+def _valid(values: FloatArray, ending: RunEnding = RunEnding.INVALID) -> FloatArray:
+    if not np.isfinite(values).all():
+        raise _Ended(ending)
+    return values

@@ -6,7 +6,7 @@ import shlex
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -15,23 +15,21 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 
 import drake_dae
 from drake_dae.commands.writing import check_folder, complete, open_page, program, waiting
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter, Recorded
-from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
+from drake_dae.errors import ModelError, ScenarioError, describe_os_error
 from drake_dae.files import check_unwritten
 from drake_dae.pictures import ANIMATION, PLOTS
 from drake_dae.pictures.animation import make_animation
 from drake_dae.running.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.running.simulate import RunStatistics, simulate
-from drake_dae.scenario.build import build_completed, build_scenario
+from drake_dae.scenario.build import build_completed, build_scenario, for_rollout, roll_scenario
 from drake_dae.scenario.judging import judge_run
-from drake_dae.scenario.rolled import for_rollout, roll_scenario
-from drake_dae.scenario.scenario import Scenario, load_scenario, save_scenario, scenario_data
+from drake_dae.scenario.scenario import load_scenario, save_scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scene.view import start_meshcat
@@ -56,11 +54,12 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         check_unwritten((options.out / name for name in FILES), options.force)
 
     # The loop at its start.
-    began, config = time.perf_counter(), scenario.integrator
+    began = time.perf_counter()
     if options.rollout:
         scenario, *remarks = for_rollout(scenario)
     if options.meshcat:
-        config.target_realtime_rate = config.target_realtime_rate or 1.0
+        rate = scenario.integrator.target_realtime_rate
+        scenario.integrator.target_realtime_rate = rate or 1.0
     meshcat = start_meshcat() if options.meshcat else None
     with waiting(f"building {path.stem}"):
         completed, loop = build_completed(scenario, meshcat)
@@ -69,54 +68,111 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     took = f"{path.stem}: built in {time.perf_counter() - began:.2f} s"
     print(took, *notes, sep="\n", flush=True)
 
-    # The run, in a folder of its own.
+    # The folder, and on a terminal somebody who looks.
     folder = options.out or _new_folder(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
     folder.mkdir(parents=True, exist_ok=True)
-    for file in FILES:
-        (folder / file).unlink(missing_ok=True)
+    for name in FILES:
+        (folder / name).unlink(missing_ok=True)
     first_line = f"# Scenario as run by drake-dae {drake_dae.__version__}"
     save_scenario(scenario, folder / SCENARIO, first_line)
+    is_watched = meshcat is not None and sys.stdin is not None and sys.stdin.isatty()
+    if meshcat is not None:
+        waits = "; the run begins when this page is open" * is_watched
+        print(f"watch at {meshcat.web_url()}{waits}", flush=True)
+        while is_watched and not meshcat.GetNumActiveConnections():
+            time.sleep(0.1)
+
+    # The run.
     recorded: RecordAfter = partial(loop.record, context)
-    statistics, reason, results, problems = None, "", dict[str, Any](), list[str]()
+    statistics, ended, reason = None, None, ""
 
     def see(record: RecordAfter) -> bool:
         nonlocal recorded
         recorded = record
         return ending.signal is not None
 
-    with _watched(meshcat):
+    try:
+        if options.rollout:
+            began = time.perf_counter()
+            with ending_signals(ending := Interruption()), waiting("rolling out"):
+                rollout = roll_scenario(scenario, loop, context, look=see)
+            see(rollout.record.after)
+            if rollout.failure is not None:
+                raise rollout.failure
+            times, wall = rollout.record.time, time.perf_counter() - began
+            simulated = float(times[-1] - times[0]) if times.size else 0.0
+            statistics = RunStatistics(simulated, wall, rollout.steps, ending.signal)
+        else:
+            arguments = loop.diagram, context, scenario.duration, scenario.integrator
+            statistics = simulate(*arguments, True, scenario.judgement.may_diverge)
+    except BaseException as error:  # It is raised when the files of what was simulated are written.
+        is_cut = isinstance(error, KeyboardInterrupt)
+        ended, reason = error, "interrupted in the middle of a step" if is_cut else str(error)
+
+    # Its files. A signal from here on takes effect between the record and the pictures.
+    record, wanted = recorded(None), scenario.write
+    problems, results = list[str](), dict[str, Any]()
+
+    @contextmanager
+    def attempt(name: str) -> Iterator[Path]:
+        """Other files are written also if this one cannot be."""
         try:
-            if options.rollout:
-                began = time.perf_counter()
-                with ending_signals(ending := Interruption()), waiting("rolling out"):
-                    rollout = roll_scenario(scenario, loop, context, look=see)
-                see(rollout.record.after)
-                if rollout.failure is not None:
-                    raise rollout.failure
-                times, wall = rollout.record.time, time.perf_counter() - began
-                simulated = float(times[-1] - times[0]) if times.size else 0.0
-                statistics = RunStatistics(simulated, wall, rollout.steps, ending.signal)
-            else:
-                arguments = loop.diagram, context, scenario.duration, scenario.integrator
-                statistics = simulate(*arguments, True, scenario.judgement.may_diverge)
-        except DrakeDaeError as error:
-            reason = str(error)
-            raise
-        except KeyboardInterrupt:
-            reason = "interrupted in the middle of a step"
-            raise
-        finally:  # The files of what has been simulated.
-            record = recorded(None)
-            if record.time.size:
-                title = f"{path.stem}: {scenario.description}".removesuffix(": ")
-                made = scenario, loop, context, record, statistics, reason
-                results, problems = _write(*made, folder, title, notes)
+            with complete(folder, name) as place:
+                yield place / name
+        except OSError as error:
+            problems.append(describe_os_error(error))
+
+    if record.time.size:
+        with ending_signals(ending := Interruption()):
+            summary = judge_run(scenario, loop, context, record, statistics, reason)
+            if wanted.record:
+                outputs = record.signals["tracking_error"].signals
+                predicted = Recorded(loop.predicted_error(record), outputs)
+                signals = {**record.signals, "predicted_error": predicted}
+                with attempt(RECORD) as file:
+                    about = {"scenario": scenario_data(scenario)}
+                    replace(record, signals=signals, about=about).save(file)
+            with attempt(SUMMARY) as file:
+                file.write_text("\n".join([summary.text, *notes, ""]), encoding="utf-8")
+        try:
+            if ending.signal is not None:
+                end_at_once(ending.signal)
+            with waiting("drawing"):
+                if wanted.plots and not isinstance(ended, KeyboardInterrupt):
+                    from drake_dae.pictures.plots import save_plots  # Matplotlib takes a second.
+
+                    with attempt(PLOTS[0]) as file:
+                        save_plots(loop, record, context, file.parent, summary.accuracy)
+                if wanted.animation and not isinstance(ended, KeyboardInterrupt):
+                    title = f"{path.stem}: {scenario.description}".removesuffix(": ")
+                    with attempt(ANIMATION) as file:
+                        page = make_animation(loop, record, context, title)
+                        file.write_text(page, encoding="utf-8")
+        finally:
+            written = [name for name in FILES if (folder / name).exists()]
+            results = {**summary.data, "files": written}
+            text, word = summary.text, summary.outcome.name
+            if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
+                color = {"GOOD": 32, "BAD": 31, "UNDECIDED": 33}[word]
+                text = f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
+            print(f"{text}\nwritten to {folder}/: {', '.join(written)}", flush=True)
+            if ANIMATION in written:
+                named = shlex.quote(str(folder))
+                plots = "" if wanted.plots else f"; plots: {program()} plot {named} --all"
+                print(f"watch it: {program()} play {named}{plots}", flush=True)
+            print(*(f"error: {line}\n" for line in problems), sep="", end="", file=sys.stderr)
+
+    # How it ended.
+    if ended is not None:
+        raise ended
+    if is_watched:
+        input("the view stays until you press Enter")
     if options.open and (folder / ANIMATION).is_file():
         open_page(folder / ANIMATION)
-    told = {"scenario": path.stem, "folder": str(folder), **results}
-    if statistics.interrupted:
-        return 128 + statistics.interrupted, told
-    return 1 if problems else 2 if options.check and results.get("missed") else 0, told
+    assert statistics is not None
+    cut = 128 + statistics.interrupted if statistics.interrupted else 0
+    code = 1 if problems else 2 if options.check and results.get("missed") else 0
+    return cut or code, {"scenario": path.stem, "folder": str(folder), **results}
 
 
 def _new_folder(name: str) -> Path:
@@ -129,94 +185,14 @@ def _new_folder(name: str) -> Path:
     return folder
 
 
-@contextmanager
-def _watched(meshcat: Meshcat | None) -> Iterator[None]:
-    """Waits on a terminal for somebody who looks, and at the end for Enter: then the view ends."""
-    is_asked = meshcat is not None and sys.stdin is not None and sys.stdin.isatty()
-    if meshcat is not None:
-        waits = "; the run begins when this page is open" * is_asked
-        print(f"watch at {meshcat.web_url()}{waits}", flush=True)
-    while is_asked and meshcat is not None and not meshcat.GetNumActiveConnections():
-        time.sleep(0.1)
-    yield
-    if is_asked:
-        input("the view stays until you press Enter")
-
-
-def _write(
-    scenario: Scenario,
-    loop: ClosedLoop,
-    context: Context,
-    record: Record,
-    statistics: RunStatistics | None,
-    reason: str,
-    folder: Path,
-    title: str,
-    notes: Sequence[str],
-) -> tuple[dict[str, Any], list[str]]:
-    """Writes the files and prints the summary; returns the results, and what was not written."""
-    problems, wanted = list[str](), scenario.write
-
-    @contextmanager
-    def attempt(name: str) -> Iterator[Path]:
-        """Other files are written also if this one cannot be."""
-        try:
-            with complete(folder, name) as place:
-                yield place
-        except OSError as error:
-            problems.append(describe_os_error(error))
-
-    # A signal from here on takes effect after the record is written and before the pictures.
-    with ending_signals(ending := Interruption()):
-        summary = judge_run(scenario, loop, context, record, statistics, reason)
-        if wanted.record:
-            outputs = record.signals["tracking_error"].signals
-            predicted = Recorded(loop.predicted_error(record), outputs)
-            signals = {**record.signals, "predicted_error": predicted}
-            with attempt(RECORD) as place:
-                about = {"scenario": scenario_data(scenario)}
-                replace(record, signals=signals, about=about).save(place / RECORD)
-        with attempt(SUMMARY) as place:
-            text = "\n".join([summary.text, *notes, ""])
-            (place / SUMMARY).write_text(text, encoding="utf-8")
-    try:
-        if ending.signal is not None:
-            end_at_once(ending.signal)
-        if not reason.startswith("interrupted"):
-            with waiting("drawing"):
-                if wanted.plots:
-                    from drake_dae.pictures.plots import save_plots  # Matplotlib takes a second.
-
-                    with attempt(PLOTS[0]) as place:
-                        save_plots(loop, record, context, place, summary.accuracy)
-                if wanted.animation:
-                    with attempt(ANIMATION) as place:
-                        page = make_animation(loop, record, context, title)
-                        (place / ANIMATION).write_text(page, encoding="utf-8")
-    finally:
-        written = [name for name in FILES if (folder / name).exists()]
-        text, word = summary.text, summary.outcome.name
-        if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
-            color = {"GOOD": 32, "BAD": 31, "UNDECIDED": 33}[word]
-            text = f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
-        print(f"{text}\nwritten to {folder}/: {', '.join(written)}", flush=True)
-        if ANIMATION in written:
-            named = shlex.quote(str(folder))
-            plots = "" if wanted.plots else f"; plots: {program()} plot {named} --all"
-            print(f"watch it: {program()} play {named}{plots}", flush=True)
-        print(*(f"error: {line}\n" for line in problems), sep="", end="", file=sys.stderr)
-    return {**summary.data, "files": written}, problems
-
-
 def plot_command(options: argparse.Namespace) -> int:
     """Draws signals of runs, or all plots of each, or a film."""
     from drake_dae.pictures.film import save_film
     from drake_dae.pictures.plots import plot_runs, save_plots
 
     runs, is_film = options.runs, options.film
-    for path in runs:
-        if runs.count(path) > 1:
-            raise ModelError(f"the run '{path}' is named twice; name each run once")
+    if len({*runs}) < len(runs):
+        raise ModelError(f"each run is named once, got {', '.join(map(str, runs))}")
     more = options.signals or options.errors or (options.all and (is_film or options.out))
     if (options.all or is_film) and more:
         raise ModelError("--all and --film take no other options, but --film an --out")
@@ -253,10 +229,7 @@ def plot_command(options: argparse.Namespace) -> int:
 
 def _load_record(path: Path) -> Record:
     """The record of a run: of its folder, or a file."""
-    file = path / RECORD if path.is_dir() else path
-    if path.is_dir() and not file.is_file():
-        raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
-    record = Record.load(file)
+    record = Record.load(path / RECORD if path.is_dir() else path)
     if not record.time.size:
         raise ModelError(f"the record in '{path}' has no rows")
     return record
@@ -264,8 +237,6 @@ def _load_record(path: Path) -> Record:
 
 def _run_again(folder: Path) -> tuple[ClosedLoop, Record, Context]:
     """The loop of the run in a folder, the record of the run, and a context."""
-    if not (folder / SCENARIO).is_file():
-        raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
     record = _load_record(folder)
     loop, context = build_scenario(load_scenario(folder / SCENARIO))
     if missing := loop.record(context).signals.keys() - record.signals.keys():
@@ -278,8 +249,8 @@ def play_command(options: argparse.Namespace) -> int:
     """Opens the animation of a run in the browser."""
     folder, page = options.folder, options.folder / ANIMATION
     if not (folder / SCENARIO).is_file():
-        runs = sorted(path.parent for path in folder.parent.glob(f"*/{ANIMATION}"))
-        there = f"; there is {', '.join(map(str, runs))}" if runs else ""
+        runs = sorted(str(path.parent) for path in folder.parent.glob(f"*/{ANIMATION}"))
+        there = f"; there is {', '.join(runs)}" if runs else ""
         raise ModelError(f"'{folder}' is no folder of a run{there}")
     if not page.is_file():
         raise ModelError(

@@ -1,4 +1,4 @@
-"""`drake-dae new`, `analyze`, `page` and `export`: what is made of a robot or a scenario."""
+"""`drake-dae new`, `analyze`, `sweep`, `page` and `export`: what is made of a scenario."""
 
 import argparse
 import logging
@@ -6,10 +6,12 @@ import shlex
 import sys
 import time
 import warnings
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import number_in
@@ -18,19 +20,24 @@ from drake_dae.errors import (
     DrakeDaeError,
     GeometryWarning,
     ModelError,
+    RobotFileWarning,
     ScenarioError,
     SimulationError,
 )
 from drake_dae.files import check_unwritten
 from drake_dae.robots import Vector
 from drake_dae.running.simulate import simulate
-from drake_dae.scenario.build import build_completed, build_scenario
+from drake_dae.scenario.build import build_commanded, build_completed, build_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
-from drake_dae.scenario.new import placed_scenario
-from drake_dae.scenario.robot_file.reading import RobotLinks
-from drake_dae.scenario.scenario import Scenario, load_scenario
+from drake_dae.scenario.new import new_scenario
+from drake_dae.scenario.robot_file.reading import robot_links
+from drake_dae.scenario.scenario import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.studies.runs import Outcome
+from drake_dae.studies.study import FILES
+from drake_dae.studies.sweep import sweep
+from drake_dae.studies.variations import parse_variations
 
 _CHECKED, _COMPARED = 20.0, 2.0
 """The processor time in s after which a new scenario is no longer checked, and the longest run in s
@@ -45,26 +52,10 @@ def new_command(options: argparse.Namespace) -> int:
         raise ModelError(f"'{out}' is the robot's own file; name another file for the scenario")
     # The simulation reports what it leaves out, and Drake's parser warns of every tag.
     logging.getLogger("drake").setLevel(logging.ERROR)
-    began, used = time.perf_counter(), time.process_time()
+    began, end = time.perf_counter(), time.process_time() + _CHECKED
 
     def tell(text: str) -> None:
         print(f"{time.perf_counter() - began:4.1f} s: {text}", file=sys.stderr, flush=True)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", GeometryWarning)
-        tip, point = _tip(options.tip)
-        where = options.robot, options.surface, tip, point, out.parent
-        _, text, robot = placed_scenario(*where, tell)
-        out.write_text(text, encoding="utf-8")
-        print(f"written: {out}", flush=True)
-        tell("checking it by a run")
-        verdict = _check(load_scenario(out), robot, used + _CHECKED)
-    print(f"checked: {verdict}\nnow run: {program()} simulate {shlex.quote(str(out))}")
-    return 0 if verdict.startswith("GOOD") else 2
-
-
-def _check(scenario: Scenario, robot: RobotLinks, end: float) -> str:
-    """The verdict of a run of a new scenario, or why there is none up to an end."""
 
     def look(context: Context) -> None:
         if time.process_time() > end:
@@ -72,16 +63,27 @@ def _check(scenario: Scenario, robot: RobotLinks, end: float) -> str:
             text = f"not to its end: the run takes long, and came to {now:.3g} s without a fault"
             raise SimulationError(text, now, [])
 
-    try:
-        completed, loop = build_completed(scenario, robot=robot)
-        context = start_scenario(completed.scenario, loop)
-        # The first round: the second repeats it.
-        half = replace(completed.scenario, duration=scenario.duration / 2)
-        run = simulate(loop.diagram, context, half.duration, half.integrator, look=look)
-        summary = judge_run(half, loop, context, loop.record(context), run)
-    except DrakeDaeError as error:
-        return str(error)
-    return str(summary)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)
+        tip, point = _tip(options.tip)
+        _, text = new_scenario(options.robot, options.surface, tip, point, out.parent, tell)
+        out.write_text(text, encoding="utf-8")
+        print(f"written: {out}", flush=True)
+        tell("checking it by a run")
+        warnings.simplefilter("ignore", RobotFileWarning)  # It has been told.
+        try:
+            scenario = load_scenario(out)
+            robot = robot_links(scenario.robot, SceneGraph(), drawn=False)
+            completed, loop = build_completed(scenario, robot=robot)
+            scenario, context = completed.scenario, start_scenario(completed.scenario, loop)
+            # The first round: the second repeats it.
+            half = replace(scenario, duration=scenario.duration / 2)
+            run = simulate(loop.diagram, context, half.duration, half.integrator, look=look)
+            verdict = str(judge_run(half, loop, context, loop.record(context), run))
+        except DrakeDaeError as error:
+            verdict = str(error)
+    print(f"checked: {verdict}\nnow run: {program()} simulate {shlex.quote(str(out))}")
+    return 0 if verdict.startswith("GOOD") else 2
 
 
 def _tip(text: str) -> tuple[str, Vector]:
@@ -106,10 +108,54 @@ def analyze_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return 2 if report.problems else 0, {"scenario": path.stem, **report.to_dict()}
 
 
+def sweep_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """Runs a study, or what is left of it."""
+    path = find_scenario(options.scenario)
+    scenario = load_scenario(path, options.settings)
+    variations = parse_variations(options.vary, options.random, options.seed, options.together)
+    folder = options.out or Path("runs") / f"{path.stem}-sweep"
+    check_folder(folder)
+    file = folder / "runs.db"
+    others = [name for name in FILES if (folder / name).exists()]
+    if others and not file.exists():
+        names = ", ".join(others)
+        raise ModelError(f"'{folder}' holds {names}, not from a study; choose another folder")
+    try:
+        study = sweep(
+            *(scenario, variations, file),
+            workers=options.workers,
+            progress=True,
+            rollout=options.rollout,
+            time_limit=options.time_limit,
+        )
+    except KeyboardInterrupt:
+        print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)
+        raise
+    files = [file.name, *(written.name for written in study.save(folder))]
+    print(f"{study}\nwritten to {folder}/: {', '.join(files)}", flush=True)
+    missing = {n: r for n, r in enumerate(study.results) if r.outcome is not Outcome.FINISHED}
+    report = {
+        "scenario": path.stem,
+        "folder": str(folder),
+        "runs": len(study.results),
+        "outcomes": Counter(str(result.outcome) for result in study.results),
+        "not_finished": [
+            {"run": run, "outcome": str(result.outcome), "reason": result.reason}
+            for run, result in missing.items()
+        ],
+        "figures": study.extent(),
+        "files": files,
+    }
+    if again := [str(run) for run, result in missing.items() if not result.outcome.is_final]:
+        text = "died or took too long; the same command tries again"
+        print(f"error: runs {', '.join(again[:10])} {text}", file=sys.stderr)
+        return 1, report
+    return 2 if missing and options.check else 0, report
+
+
 def page_command(options: argparse.Namespace) -> int:
     """Compiles a scenario into a page."""
     from drake_dae.pictures.page.page import write_page
-    from drake_dae.scenario.rolled import build_commanded
 
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)

@@ -8,11 +8,11 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.elimination import Elimination
+from drake_dae.dae.derivatives import Elimination
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Deciding, Samples
 from drake_dae.errors import AssumptionError
-from drake_dae.trace.round_off import (
+from drake_dae.trace.numerics import (
     SINGULAR,
     are_dependent,
     equilibrated,

@@ -14,11 +14,13 @@ that solve a linear system with one and the same matrix,
 so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and A is J M^-1 J^T.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import (
@@ -28,6 +30,7 @@ from drake_dae.trace.factorization import (
     nonzeros,
     saddle_point_solver,
 )
+from drake_dae.trace.numerics import Sized, equilibration, multiply, without_round_off
 
 
 class Derivatives:
@@ -92,7 +95,12 @@ class Derivatives:
     def derivative(self, expression: ca.SX) -> ca.SX:
         """Returns the time derivative of an expression along the motion."""
         if ca.depends_on(expression, self._symbols[-1]):
-            self._add_order()
+            following, size = self._next_unknown(), self._balance.numel()
+            self._rates.append(following)
+            both = self._total_derivative(ca.vertcat(self._balance, self._constraint_rate))
+            self._balance, self._constraint_rate = both[:size, :], both[size:, :]
+            self._symbols.append(following)
+            self._solve_order()
         return self._total_derivative(expression)
 
     def expand(self, expression: ca.SX) -> ca.SX:
@@ -101,7 +109,7 @@ class Derivatives:
 
     def by_control(self, expression: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Returns a(x) and B(x) of an expression a(x) + B(x) u of the motion."""
-        orders = self._orders_in(expression)
+        orders = self.orders_in(expression)
         slope = self._slope(expression, orders)
         unknowns = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
         zero = ca.SX.zeros(self.control.numel())
@@ -114,7 +122,7 @@ class Derivatives:
         size = expression.numel()
         return both[:size, :], ca.sparsify(ca.reshape(both[size:, :], slope.shape))
 
-    def _orders_in(self, expression: ca.SX) -> int:
+    def orders_in(self, expression: ca.SX) -> int:
         """The number of orders of unknowns in an expression."""
         used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(expression, w)]
         return max(used, default=0)
@@ -133,10 +141,6 @@ class Derivatives:
             slope += ca.mtimes(ca.jacobian(expression, unknown[which]), moves[which, :])
         return slope
 
-    def has_unknowns(self, expression: ca.SX) -> bool:
-        """Returns whether an expression contains unknowns, so that A(x) must be regular."""
-        return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
-
     def inverse(
         self, expression: ca.SX, desired: ca.SX, shown: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX, ca.SX] | None:
@@ -149,7 +153,7 @@ class Derivatives:
         determined, and what is shown; None if the equations are not linear in what it moves.
         """
         shown = ca.SX(0, 1) if shown is None else shown
-        orders = self._orders_in(ca.vertcat(expression, shown))
+        orders = self.orders_in(ca.vertcat(expression, shown))
         symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
         values = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
         moved = ca.which_depends(values, self.control, 1, True) if orders else []
@@ -248,15 +252,6 @@ class Derivatives:
         rate = ca.jtimes(expression, ca.vertcat(*moving), ca.densify(ca.vertcat(*self._rates)))
         return rate + self.system.exogenous.rate(expression) if self.system.exogenous else rate
 
-    def _add_order(self) -> None:
-        following = self._next_unknown()
-        self._rates.append(following)
-        size = self._balance.numel()
-        both = self._total_derivative(ca.vertcat(self._balance, self._constraint_rate))
-        self._balance, self._constraint_rate = both[:size, :], both[size:, :]
-        self._symbols.append(following)
-        self._solve_order()
-
     def _solve_order(self, damping: ca.SX | None = None) -> None:
         """Solves for the newest unknowns, which enter the balance and constraint rate linearly."""
         newest, rate = self._symbols[-1], self._constraint_rate
@@ -284,3 +279,54 @@ def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:
 def lie_derivative_along(expression: ca.SX, fields: ca.SX, state: ca.SX) -> ca.SX:
     """Returns [L_g1 k, ..., L_gm k] with structural zeros."""
     return ca.sparsify(ca.mtimes(ca.jacobian(expression, state), fields))
+
+
+@dataclass(frozen=True, eq=False)
+class Elimination:
+    """Equations (9)-(14) as expressions of the state; not finite where A(x) is singular.
+
+    On the manifold N* the constraint inputs are v = alpha + beta u (25), and
+
+        x' = f* + h* u,    z = l* + n* u.
+    """
+
+    constraint_gradient: ca.SX  # The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
+    constraint_matrix: ca.SX  # A(x) of Assumption (2), shape (m, m).
+    alpha: ca.SX  # v where u = 0 (13), shape (m, 1).
+    beta: ca.SX  # The factor of u in v (14), shape (m, p).
+    f_star: ca.SX  # f + g alpha (9), shape (n, 1).
+    h_star: ca.SX  # h + g beta (10), shape (n, p).
+    l_star: ca.SX  # l + m alpha (11), shape (p, 1).
+    n_star: ca.SX  # m beta (12), shape (p, p).
+    pivot: ca.SX  # A scalar that is 0 exactly where A(x) is singular.
+
+
+def eliminate(derivatives: Derivatives) -> Elimination:
+    """Derives (9)-(14) from the derivatives on N*, which are affine in the control."""
+    system = derivatives.system
+    alpha, beta = derivatives.by_control(derivatives.constraint_input)  # (13), (14), (25)
+    f_star, h_star = derivatives.by_control(derivatives.rate)  # (9), (10)
+    l_star, n_star = system.outputs(alpha), ca.sparsify(ca.mtimes(system.m, beta))  # (11), (12)
+    gradient, matrix = derivatives.constraint_gradient, derivatives.constraint_matrix
+    return Elimination(
+        gradient, matrix, alpha, beta, f_star, h_star, l_star, n_star, derivatives.pivot
+    )
+
+
+def eliminate_numbers(
+    fields: Mapping[str, FloatArray],
+    constraint_gradient: FloatArray,
+    constraint_matrix: FloatArray,
+    scale: FloatArray,
+) -> tuple[Sized, Sized]:
+    """Returns h* (10) and n* (12) at one state, without round-off."""
+    h, size = fields["h"], np.abs(fields["h"])
+    by_control = multiply(constraint_gradient, (h, size), scale)
+    # Units of the constraints' derivatives, and of the constraint inputs.
+    rows, columns = equilibration(np.abs(constraint_matrix))
+    scaled = np.linalg.inv(constraint_matrix / rows[:, None] / columns)
+    inverse = scaled / columns[:, None] / rows
+    beta = multiply(-inverse, by_control, rows)
+    added, added_size = multiply(fields["g"], beta, 1.0 / columns)
+    h_star = without_round_off(h + added, size + added_size)
+    return h_star, multiply(fields["m"], beta, 1.0 / columns)

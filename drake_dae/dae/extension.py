@@ -21,16 +21,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, unknown_name
+from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.relative_degrees import InputActions
 from drake_dae.dae.samples import Samples, spread_of
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.signals import Signal, places_of
 from drake_dae.dae.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.numerics import positive
 
 
 @checked(ModelError)
@@ -104,11 +104,10 @@ def dynamic_extension(
             f"{system.name}: control_metric compares controls, not their derivatives; leave it "
             "out, and give the extended system one"
         )
-    values, names = nominal_control or {}, [signal.name for signal in system.control_signals]
-    for name in values:
-        if name not in names:
-            raise ModelError(f"{system.name}: {unknown_name('control', name, names)}")
-    held = np.array([values.get(name, 0.0) for name in names], dtype=float)
+    given, names = nominal_control or {}, [signal.name for signal in system.control_signals]
+    held = np.zeros(len(names))
+    places = places_of("control", given, system.control_signals, f"{system.name}: ")
+    held[places] = list(given.values())
     spreads = spread_of(system, spread)
     bases = [(signal, 0) for signal in system.control_signals]  # And how often integrated.
     extended, integrators = system, dict[str, int]()

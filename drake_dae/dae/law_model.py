@@ -7,11 +7,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import numbers, positive, unknown_name
-from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import eliminate
+from drake_dae.arrays import numbers, positive
+from drake_dae.dae.derivatives import Derivatives, eliminate
 from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
-from drake_dae.dae.signals import DerivativeLayout, Signal
+from drake_dae.dae.signals import DerivativeLayout, Signal, places_of
 from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
@@ -224,12 +223,12 @@ class IntegralAction:
         names: Sequence[str],
         measured: ForceMeasurement | None,
     ) -> None:
-        known, integrated = [signal.name for signal in system.output_signals], set[int]()
-        for name in names:
-            if name not in known:
-                raise GainError(f"integral: {unknown_name('output', name, known)}")
-            i = known.index(name)
-            if i in integrated:
+        try:
+            chosen = places_of("output", names, system.output_signals, "integral: ")
+        except ModelError as error:
+            raise GainError(str(error)) from None
+        for i, name in zip(chosen, names, strict=True):
+            if chosen.count(i) > 1:
                 raise GainError(f"integral: '{name}' occurs twice")
             if degrees[i] == 0 and (measured is None or i not in measured.rows):
                 raise GainError(
@@ -237,18 +236,12 @@ class IntegralAction:
                     "no error to integrate; make the law with measured_force=True, and integrate "
                     "a constraint input or a combination of some"
                 )
-            integrated.add(i)
-        self.outputs, self.degrees, self._measured = sorted(integrated), degrees, measured
+        self.outputs, self.degrees, self._measured = sorted(chosen), degrees, measured
         self._starts = DerivativeLayout(degrees).starts.tolist()
         signals = [system.output_signals[i] for i in self.outputs]
         named = [Signal(f"integral of {s.name}", f"{s.unit or '1'} s") for s in signals]
         self.signals = tuple(named)
         self.symbol = ca.SX.sym("integral", len(self.outputs))
-
-    @property
-    def all_degrees(self) -> tuple[int, ...]:
-        """The number of poles of each output."""
-        return tuple(degree + (i in self.outputs) for i, degree in enumerate(self.degrees))
 
     def coordinates(self, errors: ca.SX) -> ca.SX:
         """Returns the error coordinates, with the integrals among them."""

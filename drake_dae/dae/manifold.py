@@ -10,21 +10,24 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.signals import DerivativeLayout, Indices
+from drake_dae.dae.signals import DerivativeLayout, Indices, places_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization, nonzeros
 from drake_dae.trace.functions import TracedFunction, count_operations
-from drake_dae.trace.newton import (
+from drake_dae.trace.numerics import (
     PRECISION,
     ROUNDING,
     NewtonModel,
+    are_dependent,
     newton,
     norm,
+    polished,
+    positive,
     shortest_steps,
     steps_along,
+    unit_rows,
 )
-from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
 POLE = 1e-3  # A larger residual, over its usual change by the scale of the states, is no round-off.
 NEAR_POLE = 1e-6, 1e-3  # The distances at which poles show, in states over their scale.
@@ -60,8 +63,7 @@ class Manifold:
         self._gradient = system.trace("manifold gradient", outputs, often=False)
         usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
         # Of the residuals: how much they change while the states change by their scale.
-        self._usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
-        self._settling = _Settling(self)
+        self._usual = np.maximum(np.where(np.isfinite(usual).all(), usual, 0.0), 1.0)
 
     @property
     def dimension(self) -> int:
@@ -118,8 +120,7 @@ class Manifold:
             regular = ca.if_else(normal.pivot > 0, 0, ca.SX.nan())
             solved = normal.solve(self.residual_expression / sizes)
             step = regular - ca.mtimes(scaled.T, solved)
-        inputs = {"other": other}
-        return self.system.trace("step to the manifold", {"step": step}, inputs)
+        return self.system.trace("step to the manifold", {"step": step}, {"other": other})
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
     def _relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
@@ -176,15 +177,7 @@ class Manifold:
         step = step_from(moved, start, p)[0]
         left = norm(scale * step / unit)
         if left * left <= PRECISION * size:  # The test of `newton`, without its overhead.
-            length = norm(step)
-            while length > 0.0:
-                moved = moved + scale * step
-                step = step_from(moved, start, p)[0]
-                following = norm(step)
-                if not following < 0.5 * length:
-                    break
-                length = following
-            return moved
+            return polished(moved, scale * step, lambda x: scale * step_from(x, start, p)[0])
 
         def linearize(z: FloatArray) -> NewtonModel:
             x = scale * z
@@ -216,9 +209,7 @@ class Manifold:
             return self.residual_function(self.scale * z, p)[0]
 
         steps = shortest_steps(gradients, residual)
-        if steps is None:
-            return None
-        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
+        return steps and steps._replace(measure=lambda z: norm(residual(z) / length))
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
@@ -229,34 +220,41 @@ class Manifold:
         """
         away = self.scale * np.random.default_rng(0).normal(size=x.size)
         left, near, far = (
-            norm(self.residual_function.evaluate(state, p)[0] / np.maximum(self._usual, 1.0))
+            norm(self.residual_function.evaluate(state, p)[0] / self._usual)
             for state in (x, x + NEAR_POLE[0] * away, x + NEAR_POLE[1] * away)
         )
         return not left <= POLE or bool(near > 1.0 and near > far)
 
     def _failed(self, state: FloatArray, p: FloatArray, why: str) -> InconsistentStateError:
         """The exception for a search that ends at a state which is not consistent."""
-        residual = self.residual(state, p)
-        values = zip(self.residual_signals, residual, strict=True)
-        bad = [signal.name for signal, value in values if not np.isfinite(value)]
+        residual, names = self.residual(state, p), [each.name for each in self.residual_signals]
         worst = int(np.argmax(np.abs(residual)))
         text = (
-            f"no consistent state found near the given one; {self.residual_signals[worst].name} = "
+            f"no consistent state found near the given one; {names[worst]} = "
             f"{residual[worst]:.3g} is left at {why}"
         )
-        if bad:
-            text = (
-                f"{', '.join(bad)} is not finite at the given state; start inside the domain of "
-                "the constraints"
-            )
+        if not np.isfinite(residual).all():
+            bad = ", ".join(names[i] for i in np.flatnonzero(~np.isfinite(residual)))
+            text = f"{bad} is not finite at the given state; start inside the domain of "
+            text += "the constraints"
         return InconsistentStateError(f"{self.system.name}: {text}", residual)
 
     def settle(
         self, state: ArrayLike, parameters: ArrayLike | None = None, fixed: Sequence[str] = ()
     ) -> FloatArray:
-        """Returns the consistent state next to a user's start, computed level by level."""
+        """Returns the consistent state next to a user's start, level by level: positions first.
+
+        Newton's method is used on each order of derivatives, by the states that are new in it. A
+        mechanical system E x' = f + g v has constraint forces along the gradients of its
+        constraints. Their impulses change velocities by dv = M^-1 J^T mu, the change of least
+        kinetic energy. Positions change in the same way, dq = N M^-1 N^T J_q^T mu with q' = N v. So
+        heavy bodies move little in any units, and coordinates on which no constraint force acts do
+        not change. Where constraint forces do work, steps are shortest relative to the scale of the
+        states.
+        """
         start, p = self._state(state), self.system.parameter_vector(parameters)
-        chosen = np.array(self.system.states_named(fixed), dtype=np.intp)
+        named = places_of("state", fixed, self.system.state_signals, f"{self.system.name}: ")
+        chosen = np.array(named, dtype=np.intp)
         residual = self.residual(start, p)
         if not residual.any():
             return start
@@ -269,10 +267,9 @@ class Manifold:
             f"{', '.join(fixed)} keep their values; fix fewer states, or give others",
             residual,
         )
-        random = np.random.default_rng(0)
+        random, free = np.random.default_rng(0), np.setdiff1d(self._levels[0][1], chosen)
         for spread in (0.0, *np.geomspace(0.1, 3.0, RESTARTS)):
             moved = start.copy()
-            free = np.setdiff1d(self._settling.places, chosen)
             moved[free] += spread * self.scale[free] * random.normal(size=free.size)
             try:
                 found = self._settled(moved, p, chosen)
@@ -284,14 +281,27 @@ class Manifold:
 
     def _settled(self, start: FloatArray, p: FloatArray, chosen: Indices) -> FloatArray | None:
         """The state next to a start where chosen states, and if possible velocities, stay."""
-        wanted = np.union1d(chosen, self._settling.moving_states(start))
+        # The states that are new in derivatives of constraints and not 0, where others are 0.
+        moving = [new[start[new] != 0.0] for _, new, _ in self._levels[1:] if not start[new].all()]
+        wanted, ways = np.unique(np.concatenate([chosen, *moving])), [self._levels]
+        if self._does_no_work(start, p):
+            # The number of further derivatives of a row until the constraint inputs act.
+            degrees, orders = self.layout.degrees, self.layout.orders
+            further = np.repeat(degrees, degrees).astype(int) - 1 - orders
+            kinetic: list[Level] = [
+                (np.flatnonzero(further == depth), self._groups[depth], depth)
+                for depth in reversed(range(len(self._groups)))
+                if np.any(further == depth)
+            ]
+            ways = [kinetic, self._levels]
         for kept in (wanted, chosen) if wanted.size > chosen.size else (chosen,):
-            found = self._settling.settled(start, p, kept)
-            if found is None:
-                continue
-            far = norm((found - start) / self.scale)
-            if kept is chosen or far <= FAR * norm(start / self.scale):
-                return found
+            for levels in ways:
+                state = start.copy()
+                if all(self._met(state, p, kept, *level) for level in levels):
+                    far = norm((state - start) / self.scale)
+                    if kept is chosen or far <= FAR * norm(start / self.scale):
+                        return state
+                    break
         return None
 
     def _state(self, state: ArrayLike) -> FloatArray:
@@ -302,63 +312,17 @@ class Manifold:
             raise ModelError(f"{name}: a state has shape ({size},), got {x.shape}")
         return x
 
-
-class _Settling:
-    """From a user's start to N* level by level: positions first, then velocities.
-
-    Newton's method is used on each order of derivatives, by the states that are new in it. A
-    mechanical system E x' = f + g v has constraint forces along the gradients of its constraints.
-    Their impulses change velocities by dv = M^-1 J^T mu, the change of least kinetic energy.
-    Positions change in the same way, dq = N M^-1 N^T J_q^T mu with q' = N v. So heavy bodies move
-    little in any units, and coordinates on which no constraint force acts do not change. Where
-    constraint forces do work, steps are shortest relative to the scale of the states.
-    """
-
-    def __init__(self, manifold: Manifold) -> None:
-        self._manifold, self._system, layout = manifold, manifold.system, manifold.layout
-        self._layout = layout
-        self._levels: list[Level] = []
-        used = nonzeros(manifold.gradient.sparsity())
+    @cached_property
+    def _levels(self) -> list[Level]:
+        """The levels by the order of derivatives, with the states that are new in each."""
+        used, levels = nonzeros(self.gradient.sparsity()), list[Level]()
         taken = np.zeros(used.shape[1], dtype=bool)
-        for order in range(max(layout.degrees, default=0)):
-            rows = np.flatnonzero(layout.orders == order)
+        for order in range(max(self.layout.degrees)):
+            rows = np.flatnonzero(self.layout.orders == order)
             new = used[rows].any(axis=0) & ~taken
             taken |= new
-            self._levels.append((rows, np.flatnonzero(new), None))
-
-    @property
-    def places(self) -> Indices:
-        """The states on which the constraints themselves depend, such as positions."""
-        return self._levels[0][1] if self._levels else np.zeros(0, dtype=np.intp)
-
-    def moving_states(self, start: FloatArray) -> Indices:
-        """The states that are new in derivatives of constraints and not 0, where others are 0."""
-        found = [np.zeros(0, dtype=np.intp)]
-        for _, columns, _ in self._levels[1:]:
-            moving = columns[start[columns] != 0.0]
-            found += [moving] if moving.size < columns.size else []
-        return np.concatenate(found)
-
-    def settled(
-        self, start: FloatArray, parameters: FloatArray, kept: Indices
-    ) -> FloatArray | None:
-        """The consistent state next to one, with some states kept; None if there is none near."""
-        ways = [self._levels]
-        if self._does_no_work(start, parameters):
-            # The number of further derivatives of a row until the constraint inputs act.
-            degrees, orders = self._layout.degrees, self._layout.orders
-            further = np.repeat(degrees, degrees).astype(int) - 1 - orders
-            kinetic: list[Level] = [
-                (np.flatnonzero(further == depth), self._groups[depth], depth)
-                for depth in reversed(range(len(self._groups)))
-                if np.any(further == depth)
-            ]
-            ways = [kinetic, self._levels]
-        for levels in ways:
-            state = start.copy()
-            if all(self._met(state, parameters, kept, *level) for level in levels):
-                return state
-        return None
+            levels.append((rows, np.flatnonzero(new), None))
+        return levels
 
     def _met(
         self,
@@ -371,7 +335,7 @@ class _Settling:
     ) -> bool:
         """Changes new states that are not kept so that some rows of the residual vanish."""
         columns = np.setdiff1d(new, kept)
-        scale = self._system.scale[columns]
+        scale = self.scale[columns]
 
         def filled(z: FloatArray) -> FloatArray:
             x = state.copy()
@@ -379,11 +343,11 @@ class _Settling:
             return x
 
         def residual(z: FloatArray) -> FloatArray:
-            return self._manifold.residual(filled(z), parameters)[rows]
+            return self.residual(filled(z), parameters)[rows]
 
         def linearize(z: FloatArray) -> NewtonModel | None:
             x = filled(z)
-            gradients = self._manifold.gradients(x, parameters)[np.ix_(rows, columns)]
+            gradients = self.gradients(x, parameters)[np.ix_(rows, columns)]
             if depth is None or columns.size < new.size:
                 return shortest_steps(gradients * scale, residual)
             # W^-1 C^T, where W is the metric of the states of this level.
@@ -397,7 +361,7 @@ class _Settling:
             return steps_along(gradients * scale, moved / scale[:, None], residual)
 
         if not columns.size:
-            gradients = self._manifold.gradients(state, parameters)[rows] * self._system.scale
+            gradients = self.gradients(state, parameters)[rows] * self.scale
             allowed = CONSISTENT * np.linalg.norm(gradients, axis=1)
             return bool(np.all(np.abs(residual(np.zeros(0))) <= allowed))
         z, converged = newton(state[columns] / scale, linearize)
@@ -407,7 +371,7 @@ class _Settling:
     @cached_property
     def _groups(self) -> list[Indices]:
         """The states whose rates contain constraint inputs, then those that depend on these."""
-        system = self._system
+        system = self.system
         mass = nonzeros(system.mass_matrix.sparsity())
         moved = nonzeros(system.g.sparsity()).any(axis=1)
         for _ in range(system.num_states):
@@ -416,7 +380,7 @@ class _Settling:
         plain = (mass.sum(axis=1) == 1) & np.array(of_one)
         uses = nonzeros(ca.jacobian_sparsity(system.f, system.state))
         groups, following, taken = list[Indices](), moved, moved
-        while following.any() and len(groups) < max(self._layout.degrees, default=0):
+        while following.any() and len(groups) < max(self.layout.degrees, default=0):
             groups.append(np.flatnonzero(following))
             following = uses[:, groups[-1]].any(axis=1) & ~taken & plain
             taken = taken | following
@@ -425,7 +389,7 @@ class _Settling:
     @cached_property
     def _metric(self) -> tuple[TracedFunction, list[tuple[int, int]]]:
         """M, the forces along velocities, and dq'/dv, d(q')/dq, ...; and their shapes."""
-        system, groups = self._system, [group.tolist() for group in self._groups]
+        system, groups = self.system, [group.tolist() for group in self._groups]
         moving = groups[0]
         forces = system.frictional_contacts.without_friction(system.g)[moving, :]
         outputs = {"mass": system.mass_matrix[moving, moving], "forces": forces}
@@ -443,11 +407,11 @@ class _Settling:
 
     def _does_no_work(self, state: FloatArray, parameters: FloatArray) -> bool:
         """Whether all constraint forces are along their gradients at a state."""
-        if not len(self._groups) == max(self._layout.degrees, default=0) > 0:
+        if not len(self._groups) == max(self.layout.degrees, default=0) > 0:
             return False
         forces = self._metric_at(state, parameters)[1]
-        gradients = self._manifold.gradients(state, parameters)
-        across = gradients[np.ix_(self._layout.ends, self._groups[0])].T
+        gradients = self.gradients(state, parameters)
+        across = gradients[np.ix_(self.layout.ends, self._groups[0])].T
         lengths = np.linalg.norm(across, axis=0), np.linalg.norm(forces, axis=0)
         if not all(np.all(np.isfinite(length)) and np.all(length > 0.0) for length in lengths):
             return False

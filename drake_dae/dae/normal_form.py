@@ -13,8 +13,7 @@ from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.expressions import find_flaw
-from drake_dae.trace.newton import NewtonModel, newton
-from drake_dae.trace.round_off import unit_rows
+from drake_dae.trace.numerics import NewtonModel, newton, unit_rows
 
 # Single states complete the chains if the sine of their smallest angle is above this.
 TRANSVERSAL = 0.05
@@ -60,7 +59,7 @@ class NormalForm:
         *,
         structure: Structure | None = None,
     ) -> None:
-        structure = structure_of("NormalForm", system, structure, find_structure)
+        structure = structure_of(system, structure, find_structure)
         self.structure, self.system = structure, system
         if structure.control_margin.is_singular:
             raise ModelError(

@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import Booleans, FloatArray, unknown_name
+from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.arrays import positive as positive_number
 from drake_dae.dae.assumptions import redundant_constraints
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Samples, draw
+from drake_dae.dae.signals import places_of
 from drake_dae.dae.system import DaeSystem, ForceSharing
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
-from drake_dae.trace.newton import ROUND_OFF
-from drake_dae.trace.round_off import (
+from drake_dae.trace.numerics import (
+    ROUND_OFF,
     equilibrated,
     positive,
     rank_of,
@@ -102,13 +103,10 @@ def share_forces(
         ModelError: As of `drop_constraints`; or a compliance is not positive, or an output is not a
             function of the sum G v_all, and so not determined.
     """
-    inputs = [signal.name for signal in system.constraint_input_signals]
-    weights = np.ones(len(inputs))
-    for name, value in (compliances or {}).items():
-        if name not in inputs:
-            raise ModelError(f"{system.name}: {unknown_name('constraint force', name, inputs)}")
-        what = f"{system.name}: the compliance of '{name}'"
-        weights[inputs.index(name)] = positive_number(what, value)
+    weights, given = np.ones(system.num_constraints), compliances or {}
+    signals, owner = system.constraint_input_signals, f"{system.name}: "
+    for name, i in zip(given, places_of("constraint force", given, signals, owner), strict=True):
+        weights[i] = positive_number(f"{owner}the compliance of '{name}'", given[name])
     samples = all_constraints_hold(system)
     kept, left_out = _independent(samples) if names is None else _split(system, names)
     if not left_out:
@@ -192,11 +190,8 @@ class _Redundant(Manifold):
 
 def _split(system: DaeSystem, names: Sequence[str]) -> tuple[list[int], list[int]]:
     """The indices of the constraints that stay, and of those that are named."""
-    signals = [signal.name for signal in system.constraint_output_signals]
-    for name in names:
-        if name not in signals:
-            raise ModelError(f"{system.name}: {unknown_name('constraint', name, signals)}")
-    left_out = [i for i, name in enumerate(signals) if name in names]
+    signals = system.constraint_output_signals
+    left_out = sorted(set(places_of("constraint", names, signals, f"{system.name}: ")))
     return [i for i in range(len(signals)) if i not in left_out], left_out
 
 

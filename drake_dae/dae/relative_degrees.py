@@ -13,15 +13,20 @@ import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.assumptions import Violation, ViolationKind, redundant_constraints
-from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
-from drake_dae.dae.elimination import Elimination, eliminate_numbers
+from drake_dae.dae.derivatives import (
+    Derivatives,
+    Elimination,
+    eliminate_numbers,
+    lie_derivative,
+    lie_derivative_along,
+)
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Family, Samples, as_matrix, fields_at, outside
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError
 from drake_dae.trace.factorization import nonzeros
-from drake_dae.trace.round_off import MANY, VISIBLE, Sized, multiply
+from drake_dae.trace.numerics import MANY, VISIBLE, Sized, multiply
 
 # Rows of numbers at a state for values of all parameters, without round-off, with their sizes
 # before cancellation.
@@ -111,7 +116,7 @@ def output_chains(
                     others.examine(i, 4, 0, samples, actions.feedthrough, i)
                 still.append(i)
                 chains[i].append(following[row])
-                need_force = need_force or derivatives.has_unknowns(moving[row])
+                need_force = need_force or derivatives.orders_in(moving[row]) > 0
         if not still:
             break
         last = ca.vertcat(*[chains[i][-1] for i in still])

@@ -51,12 +51,14 @@ def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
     return tuple(Signal(name, unit) for name in names)
 
 
-def outputs_named(names: Collection[str], outputs: Sequence[Signal]) -> list[int]:
-    """Returns the indices of outputs by their names."""
-    known = [signal.name for signal in outputs]
+def places_of(
+    what: str, names: Collection[str], signals: Sequence[Signal], owner: str = ""
+) -> list[int]:
+    """Returns the indices of signals by their names."""
+    known = [signal.name for signal in signals]
     for name in names:
         if name not in known:
-            raise ModelError(unknown_name("output", name, known))
+            raise ModelError(f"{owner}{unknown_name(what, name, known)}")
     return [known.index(name) for name in names]
 
 

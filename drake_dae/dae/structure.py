@@ -20,8 +20,7 @@ from drake_dae.dae.assumptions import (
     find_dependence,
     redundant_constraints,
 )
-from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import Elimination, eliminate
+from drake_dae.dae.derivatives import Derivatives, Elimination, eliminate
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.margins import RankMargin, find_margin
 from drake_dae.dae.redundancy import all_constraints_hold
@@ -32,7 +31,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.factorization import Factorization, nearest_solution
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibrated, equilibration, positive, smallest_singular_value
+from drake_dae.trace.numerics import equilibrated, equilibration, positive, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 
@@ -134,20 +133,6 @@ class Structure(ConstraintStructure):
         """The output chains in one column, in the order of `layout`, shape (sum mu_i, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[e for chain in self.output_chains for e in chain])
 
-    def motion_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """Returns x', v and a pivot under the control of `control_for`, solved together with it.
-
-        None if the control is not found in this way, or if friction may leave the motion
-        undetermined.
-        """
-        if self.system.control_metric is not None or self.system.frictional_contacts:
-            return None
-        motion, size = self.derivatives, self.system.num_states
-        shown = ca.vertcat(motion.rate, motion.constraint_input)
-        if (solution := motion.inverse(self.highest_derivatives, commanded, shown)) is None:
-            return None
-        return solution[2][:size, :], solution[2][size:, :], solution[1]
-
     def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Returns u = B(x)^-1 (-a(x) + ubar) (28), and a scalar that is 0 where it is undetermined.
 
@@ -228,22 +213,15 @@ def examine_structure(
     return structure, control_violation(structure)
 
 
-def constraint_structure_of(
-    owner: str, system: DaeSystem, structure: ConstraintStructure | None
-) -> ConstraintStructure:
-    """Returns the given structure of a system, or the result of `find_constraint_structure`."""
-    return structure_of(owner, system, structure, find_constraint_structure)
-
-
 def structure_of(
-    owner: str, system: DaeSystem, structure: Kind | None, find: Callable[[DaeSystem], Kind]
+    system: DaeSystem, structure: Kind | None, find: Callable[[DaeSystem], Kind]
 ) -> Kind:
-    """Returns the given structure of a system, or the one that is found."""
+    """Returns the given structure of a system, or what `find` finds."""
     if structure is None:
         return find(system)
     if structure.system is not system:
         raise ModelError(
-            f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
+            f"the structure is that of another system, '{structure.system.name}' and not "
             f"'{system.name}'. Omit it, or pass the structure of this system"
         )
     return structure
@@ -280,11 +258,8 @@ def check_system(system: DaeSystem) -> None:
     """Checks the number of constraints and the mass matrix of a system."""
     _check_positive_definite(system, "mass_matrix", system.nominal_state[None])
     if system.num_constraints > system.num_states:
-        raise Violation(2, ViolationKind.COUNT, _names(system)).error()
-
-
-def _names(system: DaeSystem) -> tuple[str, ...]:
-    return tuple(signal.name for signal in system.constraint_output_signals)
+        names = tuple(signal.name for signal in system.constraint_output_signals)
+        raise Violation(2, ViolationKind.COUNT, names).error()
 
 
 def _check_positive_definite(system: DaeSystem, key: str, states: FloatArray) -> None:
@@ -445,5 +420,5 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
     # A gradient that vanishes wherever its constraint holds does not depend on others.
     if not combinations or not all(combination.others for combination in combinations):
         return violation
-    names, redundant = _names(system), ViolationKind.REDUNDANT
-    return Violation(2, redundant, names, combinations=combinations, deciding=violation.deciding)
+    names, kind = tuple(s.name for s in system.constraint_output_signals), ViolationKind.REDUNDANT
+    return Violation(2, kind, names, combinations=combinations, deciding=violation.deciding)

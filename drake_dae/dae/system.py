@@ -19,7 +19,7 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import SINGULAR
+from drake_dae.trace.numerics import SINGULAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,21 +404,13 @@ class DaeSystem:
                 to[..., :count] = moved[..., :count]
         return parameters
 
-    def states_named(self, names: Sequence[str]) -> list[int]:
-        """Returns the indices of states by their names."""
-        known = [signal.name for signal in self.state_signals]
-        for name in names:
-            if name not in known:
-                raise ModelError(f"{self.name}: {unknown_name('state', name, known)}")
-        return [known.index(name) for name in names]
-
     def state_vector(self, state: ArrayLike) -> FloatArray:
         """Checks a state and returns it as a new array of shape (n,)."""
         return vector(f"{self.name}: a state", state, self.num_states)
 
     def parameter_slice(self, name: str) -> slice:
         """Returns the place of a parameter in the parameter vector."""
-        if name not in self.exogenous.slices:
+        if (slices := self.exogenous.slices).get(name) is None:
             known = [p.name for p in self.parameters]
             raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
-        return self.exogenous.slices[name]
+        return slices[name]

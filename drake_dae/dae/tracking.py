@@ -74,7 +74,7 @@ class TrackingLaw:
         contact_stiffness: float | None = None,
         latency: float = 0.0,
     ) -> None:
-        self.structure = structure_of("TrackingLaw", system, structure, find_structure)
+        self.structure = structure_of(system, structure, find_structure)
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:
@@ -123,9 +123,6 @@ class TrackingLaw:
         if self.integral.outputs:
             inputs["integral"] = self.integral.symbol
             outputs["integral_rate"] = self.integral.rate(chain, values)
-        self.control_takes_force = measured is not None and bool(
-            ca.depends_on(ca.vertcat(control, output), measured.symbol)
-        )
         # The initial value of (30).
         start = self.integral.coordinates(own - reference[layout.chained.tolist(), :])
         self.coordinates_function = self.system.trace(
@@ -154,11 +151,17 @@ class TrackingLaw:
         """Traces x' and v of a plant that equals the law's model, under the law."""
         if self._law_structure is not self.structure:
             return None
-        if (motion := self.structure.motion_for(self._ubar)) is None:
+        system, motion = self.system, self.structure.derivatives
+        # With more controls than outputs, and where friction may leave the motion undetermined.
+        if system.control_metric is not None or system.frictional_contacts:
             return None
-        rate, force, pivot = motion
-        outputs, name = {"rate": rate, "force": force}, f"{self.system.name} under its law"
-        return TracedFunction(name, self.inputs, outputs, pivot, often=False)
+        shown = ca.vertcat(motion.rate, motion.constraint_input)
+        solution = motion.inverse(self.structure.highest_derivatives, self._ubar, shown)
+        if solution is None:
+            return None
+        rate, force = ca.vertsplit(solution[2], [0, system.num_states, shown.numel()])
+        outputs, name = {"rate": rate, "force": force}, f"{system.name} under its law"
+        return TracedFunction(name, self.inputs, outputs, solution[1], often=False)
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -168,7 +171,9 @@ class TrackingLaw:
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
         """Checks gains, or designs them, for the outputs of this law."""
         names = tuple(signal.name for signal in self.system.output_signals)
-        return designed("gains", gains, names, self.integral.all_degrees)
+        more = [i in self.integral.outputs for i in range(len(names))]  # A pole each.
+        degrees = tuple(degree + own for degree, own in zip(self.degrees, more, strict=True))
+        return designed("gains", gains, names, degrees)
 
     def all_parameters(
         self, parameters: ArrayLike | None = None, gains: GainDesign | FeedbackGains | None = None

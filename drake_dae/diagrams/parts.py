@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,18 +14,15 @@ from drake_dae.arrays import unknown_name
 from drake_dae.errors import WiringError
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import velocities_are_rates
-from drake_dae.systems.control.commanded import CommandedReferences
-from drake_dae.systems.control.contract import SIGNAL, Controller
-from drake_dae.systems.control.drives import Sampling
-from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.observing.estimator import StateEstimator
-from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.encoders import Encoders, StateSensor
-from drake_dae.systems.sensing.force_sensor import ForceSensor
+from drake_dae.systems.applied_control import Sampling
+from drake_dae.systems.break_away import Observing
+from drake_dae.systems.controller import SIGNAL, Controller
+from drake_dae.systems.estimator import StateEstimator
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.references import CommandedReferences, ReferenceGenerator
+from drake_dae.systems.sensors import Encoders, ForceSensor, StateSensor
 
-ENCODER_NOISE = "encoder_noise"
-"""The name of the source of the noise of encoders."""
+ENCODER_NOISE = "encoder_noise"  # the name of the source
 
 
 @checked(WiringError)
@@ -73,39 +69,22 @@ def misfits(
     plant: Plant, controller: Controller, reference: ReferenceGenerator | None, parts: LoopSettings
 ) -> Iterator[str]:
     """What does not fit together, for messages; Drake would name only the ports."""
-    sensor, encoders, observer, dae = parts.sensor, parts.encoders, parts.observer, plant.dae
-    measured, forces = controller.law.measured_force, dae.num_constraints
-    takes_references = controller.HasInputPort("reference")
-    if takes_references and reference is None:
+    encoders, observer, measured = parts.encoders, parts.observer, controller.law.measured_force
+    if controller.HasInputPort("reference") and reference is None:
         remedy = "ReferenceGenerator(references, controller.law.layout.reference_degrees)"
         yield f"{controller.get_name()} needs a {remedy}"
-    if reference is not None and not takes_references:
+    if reference is not None and not controller.HasInputPort("reference"):
         yield f"{controller.get_name()} plans its references itself: leave `reference` out"
-    if sensor is not None:
-        felt = sensor.GetInputPort("force").size()
-        names = ", ".join(signal.name for signal in dae.constraint_input_signals) or "none"
-        if felt != forces:
-            has = f"the plant '{dae.name}' has {forces} ({names})"
-            yield f"the sensor measures {felt} forces, {has}; take ForceSensor({forces}, ...)"
-        if not controller.HasInputPort("measured_force"):
-            yield "the law takes no measured force; make it with measured_force=True"
-    if (
-        parts.control_limits is not None
-        and (size := np.size(parts.control_limits)) != dae.num_controls
-    ):
-        yield f"control_limits has {size} entries, there are {dae.num_controls} controls"
+    if parts.sensor is not None and not controller.HasInputPort("measured_force"):
+        yield "the law takes no measured force; make it with measured_force=True"
     if observer is None:
         return
-    plans, estimates = (
-        controller.HasOutputPort("contact_reference"),
-        observer.state_rate is not None,
-    )
-    if reference is None and not plans:
-        yield "observer: it needs the references of a generator, and there is none"
+    plans = controller.HasOutputPort("contact_reference")
+    estimates = observer.state_rate is not None
     if not parts.period(plant.time_step):
         yield "an observer observes at samples: take a sampling=Sampling(period) or a ContactPlant"
     remedy = "make the law with measured_force=True (in a scenario: sensors.force)"
-    if forces and not (measured or estimates):
+    if plant.dae.num_constraints and not (measured or estimates):
         or_state = "or give the observer a state_rate and the loop encoders"
         yield f"an observer needs the measured force: {remedy}, {or_state}"
     if plans and not measured:
@@ -119,19 +98,25 @@ def misfits(
 def check_force_loop(
     plant: Plant, controller: Controller, sensor: ForceSensor | None, sampling: Sampling | None
 ) -> None:
-    """Refuses an algebraic loop by the measured force, or a sampled loop that diverges."""
+    """Refuses an algebraic loop by the measured force, or a sampled loop that diverges.
+
+    With a rigid robot the force follows the acting control, lambda = -Gbar y of an earlier sample,
+    and the sensor follows the force, y' = a y + (1 - a) lambda. With a delay of d samples each
+    sample multiplies the error by the largest root, in magnitude, of
+    z^(d + 1) - a z^d + (1 - a) Gbar = 0.
+    """
     force, measured = plant.GetOutputPort("constraint_force"), controller.law.measured_force
-    control = plant.GetInputPort("control").get_index()
-    at_once = plant.HasDirectFeedthrough(control, force.get_index())
-    if sensor is None and sampling is None:
-        reads = controller.GetInputPort("measured_force").get_index()
-        acts = controller.GetOutputPort("control").get_index()
-        if controller.HasDirectFeedthrough(reads, acts) and at_once:
-            raise WiringError(
-                "the constraint force depends on the control in the same instant, so a law that "
-                "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "
-                "time_constant or a sample_period, or a sampling"
-            )
+    acts = plant.GetInputPort("control").get_index()
+    at_once = plant.HasDirectFeedthrough(acts, force.get_index())
+    reads = controller.GetInputPort("measured_force").get_index()
+    answers = controller.GetOutputPort("control").get_index()
+    is_direct = at_once and controller.HasDirectFeedthrough(reads, answers)
+    if is_direct and sensor is None and sampling is None:
+        raise WiringError(
+            "the constraint force depends on the control in the same instant, so a law that reads "
+            "it closes an algebraic loop; pass a sensor=ForceSensor(...) with a time_constant or a "
+            "sample_period, or a sampling"
+        )
     gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
     lag, samples = (sensor.time_constant, sensor.sample_period) if sensor is not None else (0, 0)
     loops = [(samples, 0)] if samples else []
@@ -139,7 +124,11 @@ def check_force_loop(
         # The law reads what a sensor samples at the same instant one sample later.
         loops.append((sampling.period, sampling.late_samples + bool(samples)))
     for period, late in loops:
-        if (radius := _radius(gain, lag, period, late)) >= 1.0:
+        a = float(np.exp(-period / lag)) if lag else 0.0
+        polynomial = np.array([1.0, *np.zeros(late + 1)])
+        polynomial[1] -= a
+        polynomial[-1] += (1.0 - a) * gain
+        if (radius := np.max(np.abs(np.roots(polynomial)), initial=0.0)) >= 1.0:
             raise WiringError(
                 f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample of "
                 f"{period:g} s multiplies the force error by {radius:.3g}. Lower force_gain, or "
@@ -147,27 +136,12 @@ def check_force_loop(
             )
 
 
-def _radius(gain: float, lag: float, period: float, late: int) -> float:
-    """The factor by which each sample multiplies the force error of a rigid robot.
-
-    The force follows the acting control, lambda = -Gbar y of an earlier sample, and the sensor
-    follows the force, y' = a y + (1 - a) lambda. With a delay of d samples the factor is the
-    largest root, in magnitude, of z^(d + 1) - a z^d + (1 - a) Gbar = 0.
-    """
-    a = float(np.exp(-period / lag)) if lag else 0.0
-    polynomial = np.zeros(late + 2)
-    polynomial[0] = 1.0
-    polynomial[1] -= a
-    polynomial[-1] += (1.0 - a) * gain
-    return float(np.max(np.abs(np.roots(polynomial)), initial=0.0))
-
-
 def make_observer(plant: Plant, controller: Controller, parts: LoopSettings) -> StateEstimator:
     """The observer of a loop, whose settings are checked."""
     assert parts.observer is not None
     step, period, rest, late = plant.time_step, parts.period(plant.time_step), 0.0, 0.0
     if parts.sampling is not None:
-        hold = hold_before(plant, parts.sampling)
+        hold = hold_sampling(plant, parts.sampling)
         rest, late = hold.rest, hold.delay + step
     noise: tuple[ArrayLike, ArrayLike] = (0.0, 0.0)
     if parts.encoders is not None and parts.observer.state_rate is not None:
@@ -194,7 +168,7 @@ def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:
     return StateSensor(plant.dae.num_states, links.q.numel(), encoders, period)
 
 
-def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
+def hold_sampling(plant: Plant, sampling: Sampling) -> Sampling:
     """The sampling of the hold; a discrete plant adds a delay of one of its own steps."""
     step = plant.time_step
     if step and sampling.delay < step * (1.0 - 1e-9):
@@ -204,22 +178,6 @@ def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
             "delay at each step of the plant needs no sampling"
         )
     return replace(sampling, delay=max(sampling.delay - step, 0.0))
-
-
-AnySystem = TypeVar("AnySystem", bound=System)
-
-
-def add_block(builder: DiagramBuilder, block: AnySystem) -> AnySystem:
-    """Adds a block of the caller, or refuses one that belongs to another diagram."""
-    try:
-        # AddSystem refuses a block of an unfinished diagram, but one of a built diagram only Build.
-        if block.GetSystemPathname() in (f"::{block.get_name()}", "::_"):
-            return builder.AddSystem(block)
-    except RuntimeError:
-        pass
-    raise WiringError(
-        f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
-    )
 
 
 def encoder_seed(seed: int) -> int:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -63,19 +63,15 @@ class Record:
     def __post_init__(self) -> None:
         time = numbers("the times of a record", self.time)
         object.__setattr__(self, "time", time)
-        values = {"time": time} | {name: r.values for name, r in self.signals.items()}
-        lengths = {name: np.shape(each)[:1] for name, each in values.items()}
-        if time.ndim != 1 or len(set(lengths.values())) != 1:
-            text = ", ".join(f"{name} {size}" for name, size in lengths.items())
-            raise ModelError(
-                f"all signals of a record must have as many samples as time, got the sizes {text}"
-            )
-        if np.any(np.diff(self.time) <= 0.0):
-            raise ModelError("the times of a record must be strictly increasing")
+        if time.ndim != 1 or np.any(np.diff(time) <= 0.0):
+            raise ModelError("the times of a record must be strictly increasing numbers")
         for name, recorded in self.signals.items():
-            shape, count = np.shape(recorded.values), len(recorded.signals)
-            if len(shape) != 2 or shape[1] != count:
-                raise ModelError(f"'{name}' of a record has shape {shape}, but {count} names")
+            shape, wanted = np.shape(recorded.values), (time.size, len(recorded.signals))
+            if shape != wanted:
+                raise ModelError(
+                    f"'{name}' of a record has shape {shape}; with {wanted[0]} times and "
+                    f"{wanted[1]} names it must have {wanted}"
+                )
 
     def __getitem__(self, name: str) -> FloatArray:
         """The values of a signal, shape (k, size).
@@ -92,11 +88,9 @@ class Record:
         return name in self.signals
 
     def __repr__(self) -> str:
-        count, extent = self.time.size, "empty"
-        if count:
-            extent = f"{count} times from {self.time[0]:g} to {self.time[-1]:g} s"
+        extent = " from {:g} to {:g} s".format(*self.time[[0, -1]]) if self.time.size else ""
         text = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
-        return f"Record({extent}, signals={text})"
+        return f"Record({self.time.size} times{extent}, signals={text})"
 
     @checked(ModelError)
     def after(self, time: float | None) -> Self:
@@ -127,10 +121,7 @@ class Record:
         """
         samples, stops = log.FindLog(context), np.cumsum([0, *map(len, signals.values())])
         if (size := samples.get_input_size()) != stops[-1]:
-            raise ModelError(
-                f"the signals of a log have {stops[-1]} names together, but the log has {size} "
-                "entries"
-            )
+            raise ModelError(f"the signals of a log have {stops[-1]} names, the log {size} entries")
         time = samples.sample_times()
         first = 0 if after is None else _first_after(time, after)
         rows = samples.data()[:, first:].T
@@ -184,7 +175,9 @@ class Record:
         return pandas.DataFrame(self._stacked(), index=index, columns=columns)
 
     def _labels(self) -> list[tuple[str, str]]:
-        return [(name, _label(each)) for name, r in self.signals.items() for each in r.signals]
+        """For each column the signal, and the name with its unit."""
+        every = ((name, each) for name, r in self.signals.items() for each in r.signals)
+        return [(n, f"{s.name} [{s.unit}]" if s.unit else s.name) for n, s in every]
 
     def _stacked(self) -> FloatArray:
         return np.hstack([np.zeros((self.time.size, 0)), *map(self.__getitem__, self.signals)])
@@ -229,10 +222,6 @@ def _first_after(times: FloatArray, time: float) -> int:
     return int(np.searchsorted(times, time, side="right"))
 
 
-def _label(signal: Signal) -> str:
-    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
-
-
 def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
     """The number of rows before the first one in which some value is not finite."""
     finite = np.ones(count, bool)
@@ -241,8 +230,7 @@ def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
     return count if finite.all() else int(np.argmin(finite))
 
 
-@dataclass(frozen=True)
-class PhaseSpan:
+class PhaseSpan(NamedTuple):
     """A phase of a task in a record: its name, "Press" for example, its begin and end in s."""
 
     name: str

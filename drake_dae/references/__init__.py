@@ -1,30 +1,6 @@
 """References: desired values over time with all derivatives that a law needs."""
 
-from drake_dae.references.by_name import ReferenceRows, references_by_name
-from drake_dae.references.csv_file import CsvReference
-from drake_dae.references.formulas import (
-    ConstantReference,
-    ExpressionReference,
-    PointToPointReference,
-    SinusoidReference,
-)
-from drake_dae.references.paths import CircleReference, LineReference, PathLimits
-from drake_dae.references.reference import Reference, stack_references
-from drake_dae.references.splines import PolylineReference, WaypointsReference
+import lazy_loader
 
-__all__ = [
-    "CircleReference",
-    "ConstantReference",
-    "CsvReference",
-    "ExpressionReference",
-    "LineReference",
-    "PathLimits",
-    "PointToPointReference",
-    "PolylineReference",
-    "Reference",
-    "ReferenceRows",
-    "SinusoidReference",
-    "WaypointsReference",
-    "references_by_name",
-    "stack_references",
-]
+# The names stand in __init__.pyi, and are loaded when they are asked for.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

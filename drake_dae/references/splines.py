@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import factorial
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+import scipy  # SciPy loads its large parts when they are used.
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
@@ -38,6 +39,23 @@ class PiecewisePolynomials:
     breaks: FloatArray
     factors: FloatArray
 
+    @classmethod
+    def of(
+        cls, spline: Any, knots: FloatArray, times: FloatArray, unit: float, degrees: Sequence[int]
+    ) -> "PiecewisePolynomials":
+        """Those of r_1, ..., r_1^(mu_1), r_2, ..., r a spline of SciPy in times of a unit."""
+        widths, degree = np.diff(knots), spline.k
+        table = [spline.derivative(m)(knots[:-1]) / factorial(m) for m in range(degree + 1)]
+        rows = []
+        for column, mu in enumerate(degrees):
+            for j in range(mu + 1):
+                row = np.zeros((len(widths), degree + 1))
+                for m in range(j, degree + 1):
+                    grown = factorial(m) / factorial(m - j) / unit**j
+                    row[:, m - j] = table[m][:, column] * widths ** (m - j) * grown
+                rows.append(row)
+        return cls(times, np.stack(rows, axis=1))
+
     def at(self, times: FloatArray) -> FloatArray:
         """Returns the values at times in s, shape (len(times), rows)."""
         inside = np.clip(times, self.breaks[0], self.breaks[-1])
@@ -59,24 +77,19 @@ class PiecewisePolynomials:
             passed = [time >= moment for moment in self.breaks[1:-1]]
             row = ca.mtimes(ca.DM(table.T), ca.vertcat(1, *passed) - ca.vertcat(*passed, 0))
         else:
-            row = self._looked_up(table, inside)
+            pieces = np.arange(count + 1.0)
+            exact = {"lookup_mode": ["exact"]}
+            binary = {"lookup_mode": ["binary"]}
+            index = ca.interpolant("piece", "linear", [self.breaks], pieces, binary)
+            begin = ca.interpolant("begin", "linear", [pieces], self.breaks, exact)
+            entries = ca.interpolant("row", "linear", [pieces[:-1]], table.ravel(), exact)
+            found = ca.fmin(ca.floor(index(inside)), count - 1)
+            # Where round-off has moved a time just before a break past it.
+            row = entries(found - (inside < begin(found)))
         factors = ca.SX(rows * size, 1)
         factors[places] = row[2:]
         monomials = ca.vertcat(*[((inside - row[0]) / row[1]) ** k for k in range(size)])
         return ca.mtimes(ca.reshape(factors, size, rows).T, monomials)
-
-    def _looked_up(self, table: FloatArray, inside: ca.SX) -> ca.SX:
-        """Returns the row of a table at a symbolic time within the breaks."""
-        pieces = np.arange(len(table) + 1.0)
-        exact = {"lookup_mode": ["exact"]}
-        index = ca.interpolant(
-            "piece", "linear", [self.breaks], pieces, {"lookup_mode": ["binary"]}
-        )
-        begin = ca.interpolant("begin", "linear", [pieces], self.breaks, exact)
-        row = ca.interpolant("row", "linear", [pieces[:-1]], table.ravel(), exact)
-        found = ca.fmin(ca.floor(index(inside)), len(table) - 1)
-        # Where round-off has moved a time just before a break past it.
-        return row(found - (inside < begin(found)))
 
 
 class PiecewiseReference(Reference):
@@ -113,33 +126,12 @@ class TimeSpline:
 
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         """Returns the polynomials of r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
-        order, spans = self.order, len(self.points) + self.order - 1
-        difference = np.pad(self.points, ((order, order), (0, 0)), mode="edge")
-        factors = np.zeros((spans, sum(degrees) + len(degrees), order + 2))
-        places = [(i, j) for i, degree in enumerate(degrees) for j in range(degree + 1)]
-        for j in range(max(degrees) + 1):  # Delta^j c / step^j times B-splines of order + 1 - j.
-            windows = sliding_window_view(difference, order + 2 - j, axis=0)
-            values = windows @ basis_pieces(order + 1 - j).T
-            for row, place in enumerate(places):
-                if place[1] == j:
-                    factors[:, row, : order + 2 - j] = values[:, place[0]]
-            difference = np.diff(difference, axis=0) / self.step
-        breaks = self.start_time + self.step * np.arange(spans + 1, dtype=np.float64)
-        return PiecewisePolynomials(breaks, factors)
-
-
-def basis_pieces(degree: int) -> FloatArray:
-    """Returns the uniform B-splines on a span: entry (i, k) is the factor of x^i for point k."""
-    pieces = np.ones((1, 1))
-    for p in range(1, degree + 1):  # The recursion of Cox and de Boor.
-        higher = np.zeros((p + 1, p + 1))
-        for k in range(p + 1):
-            for constant, slope, source in ((p - k, 1, k - 1), (k + 1, -1, k)):
-                if 0 <= source < p:
-                    higher[:p, k] += constant / p * pieces[:, source]
-                    higher[1:, k] += slope / p * pieces[:, source]
-        pieces = higher
-    return pieces
+        held = np.pad(self.points, ((self.order, self.order), (0, 0)), mode="edge")
+        at = np.arange(-self.order - 1.0, len(held) + 1.0)
+        spline = scipy.interpolate.BSpline(at, held, self.order + 1)
+        knots = np.arange(len(self.points) + self.order, dtype=np.float64)
+        times = self.start_time + self.step * knots
+        return PiecewisePolynomials.of(spline, knots, times, self.step, degrees)
 
 
 class SplineReference(PiecewiseReference):
@@ -291,24 +283,14 @@ class WaypointsReference(PiecewiseReference):
 
     def _through(self, times: FloatArray, degrees: Sequence[int]) -> PiecewisePolynomials:
         """The spline through the points at times, and its derivatives, as polynomials."""
-        from scipy.interpolate import make_interp_spline  # It takes long to load.
-
         # In a time unit with spacing about 1: derivatives of all orders have similar sizes.
-        scale = (times[-1] - times[0]) / (len(times) - 1)
-        knots, degree = (times - times[0]) / scale, 2 * self.order + 1
+        unit = (times[-1] - times[0]) / (len(times) - 1)
+        knots, points = (times - times[0]) / unit, np.array(self.points)
         rest = [(j, np.zeros(self.size)) for j in range(1, self.order + 1)]
-        spline = make_interp_spline(knots, np.array(self.points), degree, bc_type=(rest, rest))
-        widths = np.diff(knots)[:, None]
-        table = [spline(knots[:-1], nu=m) / factorial(m) for m in range(degree + 1)]
-        rows = []
-        for column, mu in enumerate(degrees):
-            for j in range(mu + 1):
-                row = np.zeros((len(widths), degree + 1))
-                for m in range(j, degree + 1):
-                    grown = factorial(m) / factorial(m - j) / scale**j
-                    row[:, m - j] = table[m][:, column] * widths[:, 0] ** (m - j) * grown
-                rows.append(row)
-        return PiecewisePolynomials(times, np.stack(rows, axis=1))
+        spline = scipy.interpolate.make_interp_spline(
+            knots, points, 2 * self.order + 1, bc_type=(rest, rest)
+        )
+        return PiecewisePolynomials.of(spline, knots, times, unit, degrees)
 
 
 def _check_points(reference: PolylineReference | WaypointsReference) -> FloatArray:

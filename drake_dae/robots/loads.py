@@ -13,8 +13,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import numbers, positive
 from drake_dae.dae import Parameter
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.links import Kinematics, Reaction, position_index
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots.links import Kinematics, Reaction, position_index
+from drake_dae.robots.surface import Vector
 
 
 class Load(ABC):
@@ -93,9 +93,8 @@ class KnownWrench(KnownForce):
 
 @dataclass(frozen=True)
 class ScaledForce(KnownForce):
-    """A force s(t) F: "<name>.force" is F, and "<name>.course" s, exogenous and zero by default."""
+    """A force s(t) F: "<name>.force" is F, and "<name>.course" s, zero by default."""
 
-    name: str = "scaled_force"
     force: Vector = (0.0, 0.0, 0.0)
 
     @cached_property
@@ -152,11 +151,8 @@ class JointFriction(Load):
                     f"the {name} friction must be a number or one for each of the "
                     f"{len(self.joints)} joints, got {given.tolist()}"
                 )
-            values = np.broadcast_to(given, (len(self.joints),)).tolist()
-            parameters += [
-                Parameter(f"{joint}.{name}", value, unit, nonnegative=True)
-                for joint, value in zip(self.joints, values, strict=True)
-            ]
+            for joint, value in zip(self.joints, given + np.zeros(len(self.joints)), strict=True):
+                parameters.append(Parameter(f"{joint}.{name}", value, unit, nonnegative=True))
         return tuple(parameters)
 
     @property

@@ -14,13 +14,13 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, vector
 from drake_dae.dae import DaeSystem, Parameter, Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.actuation.stage import ActuationChain, Stage, chain, diagonal_parameter
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.constraints.constraint_set import ConstraintSet, LoopState
-from drake_dae.robots.constraints.couplers import plant_constraints
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots.actuation import ActuationChain, Stage, chain, diagonal_parameter
+from drake_dae.robots.constraint import Constraint, ConstraintSet
+from drake_dae.robots.couplings import plant_constraints
+from drake_dae.robots.links import Links
 from drake_dae.robots.loads import Load
+from drake_dae.robots.loops import LoopState
+from drake_dae.robots.multibody import MultibodyExpressions
 from drake_dae.robots.outputs import ForceOutput, PositionOutput, as_force_outputs, force_rows
 from drake_dae.robots.statics import StaticBalance, StaticPlacement
 from drake_dae.trace.compiled import Compiled
@@ -94,9 +94,9 @@ class RobotModel:
             forces = ()  # The robot is only simulated.
         self.forces = as_force_outputs(forces, bound)
         S = force_rows(self.forces, bound, links)  # (40)
-        self._num_forces = S.shape[0]
         h_1 = ca.vertcat(ca.SX(0, 1), *[o.expression(links) for o in self.outputs])  # (39)
         signals = [signal for output in self.outputs for signal in output.signals(links)]
+        self._num_forces = S.shape[0]
         self._check_outputs(bound.motors, signals, is_chosen=control_weights is not None)
         driven = chain(actuation, links)
         if driven.stages and bound.motors:
@@ -111,9 +111,8 @@ class RobotModel:
         efforts = links.effort_limits
         if driven.control_signals != tuple(links.actuator_signals):  # u is no joint force.
             efforts = np.full(efforts.size, np.inf)
-        motors = [joint.effort_limit for _, joint in bound.joints if joint.motor is not None]
-        self.control_limits = np.concatenate([efforts, motors])
         self.loop_joints = LoopState(bound, links)
+        self.control_limits = np.concatenate([efforts, self.loop_joints.effort_limits])
         nominal = links.default_positions if nominal_positions is None else nominal_positions
         nominal = vector(f"{name}: nominal_positions", nominal, links.q.numel())
         signals += [signal for force in self.forces for signal in force.signals(bound)]
@@ -164,7 +163,8 @@ class RobotModel:
         torque += self.loop_joints.force
         reflected = links.actuation_matrix * links.reflected_inertia @ links.actuation_matrix.T
         # Rotors move with the links, or with a stage.
-        moved = ca.SX(ca.sparsify(ca.DM(reflected * driven.carries_rotors)))
+        on_stage = any(stage.carries_rotors for stage in driven.stages)
+        moved = ca.SX(ca.sparsify(ca.DM(reflected * on_stage)))
 
         def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
             acceleration = rate[nq : nq + nv]
@@ -192,12 +192,15 @@ class RobotModel:
             m=ca.vertcat(ca.SX(h_1.numel(), m), S),
             parameters=(
                 *links.parameters,
-                *driven.parameters,
+                *(parameter for stage in driven.stages for parameter in stage.parameters),
                 *bound.parameters,
                 *(parameter for load in self.known_forces for parameter in load.parameters),
                 *choice,
             ),
-            state_signals=(*links.position_signals, *links.velocity_signals, *driven.state_signals),
+            state_signals=(
+                *(*links.position_signals, *links.velocity_signals),
+                *(signal for stage in driven.stages for signal in stage.state_signals),
+            ),
             constraint_input_signals=bound.force_signals,
             constraint_output_signals=bound.residual_signals,
             control_signals=controls,
@@ -297,59 +300,51 @@ class RobotModel:
         self, motors: Sequence[Signal], positions: Sequence[Signal], is_chosen: bool
     ) -> None:
         """Refuses a number of outputs that does not fit that of the actuators."""
-        name, links, forces = self.name, self.links, self._num_forces
-        of_joints, count = len(links.actuator_signals), len(positions)
-        nu = of_joints + len(motors)
-        if nu == 0 and count + forces:
+        actuators = [signal.name for signal in self.links.actuator_signals]
+        names = ", ".join(signal.name for signal in positions) or "none"
+        forces, count = self._num_forces, self._num_forces + len(positions)
+        nu = len(actuators) + len(motors)
+        given = f"{forces} constraint forces and {len(positions)} positions ({names})"
+        if nu == 0 and count:
             raise ModelError(
-                f"{name}: there are no actuators, so no output can be controlled, but {count} "
-                f"positions and {forces} constraint forces are outputs. To simulate it leave both "
-                "out; to steer it give joints actuators, by plant.AddJointActuator or a "
-                "<transmission>"
+                f"{self.name}: there are no actuators, so nothing can be steered: not {given}. To "
+                "simulate it leave both out; to steer it give joints actuators, by "
+                "plant.AddJointActuator or a <transmission>"
             )
         if is_chosen:
-            if not 0 < count + forces < nu:
+            if not 0 < count < nu:
                 raise ModelError(
-                    f"{name}: control_weights choose among the controls of more actuators than "
-                    f"outputs, but there are {nu} actuators and {count + forces} outputs"
+                    f"{self.name}: control_weights choose among the controls of more actuators "
+                    f"than outputs, but there are {nu} actuators and {count} outputs"
                 )
             return
-        rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if of_joints else 0
-        if rank < of_joints:
-            actuators = ", ".join(signal.name for signal in links.actuator_signals)
+        rank = int(np.linalg.matrix_rank(self.links.actuation_matrix)) if actuators else 0
+        if rank < len(actuators):
             raise ModelError(
-                f"{name}: the {of_joints} actuators {actuators} move the joints in only {rank} "
-                "independent ways; leave one out, or give control_weights and fewer outputs"
+                f"{self.name}: the {len(actuators)} actuators {', '.join(actuators)} move the "
+                f"joints in only {rank} independent ways; leave one out, or give control_weights "
+                "and fewer outputs"
             )
-        if (
-            count + forces and count + forces != nu
-        ):  # A robot that is only simulated needs no outputs.
-            names = ", ".join(signal.name for signal in positions) or "none"
-            remedy = "for fewer, control_weights choose the control"
-            if count + forces > nu:
-                remedy = (
-                    "name in `forces` those that shall be steered, [] for none, or add actuators"
-                )
+        if count not in (0, nu):  # A robot that is only simulated needs no outputs.
             raise ModelError(
-                f"{name}: {nu} actuators can steer {nu} outputs, not {forces} constraint forces "
-                f"and {count} positions ({names}); {remedy}"
+                f"{self.name}: {nu} actuators can steer {nu} outputs, not {given}; for fewer, "
+                "control_weights choose the control; for more, name in `forces` those that shall "
+                "be steered, [] for none, or add actuators"
             )
 
     def _check_mass_matrix(self, nominal: FloatArray) -> None:
         """Refuses an M, without rotors that move with a stage, that is not positive definite."""
-        dae, links = self.dae, self.links
-        nq, nv = links.q.numel(), links.v.numel()
-        inputs = {"q": links.q, "parameters": dae.parameter_symbol}
+        dae, (nq, nv) = self.dae, self.links.velocity_map.shape
+        inputs = {"q": self.links.q, "parameters": dae.parameter_symbol}
         expression = dae.mass_matrix[nq : nq + nv, nq : nq + nv]
         function = TracedFunction("mass matrix", inputs, {"mass_matrix": expression})
         mass = np.atleast_2d(function(nominal, dae.parameter_values)[0])
         asymmetry = np.abs(mass - mass.T).max()
         if asymmetry > 1e-9 * np.abs(mass).max():
-            raise ModelError(f"{dae.name}: M(q) is not symmetric, by {asymmetry:.2g}")
-        smallest = float(np.linalg.eigvalsh(mass)[0])
-        if smallest <= 0.0:
+            raise ModelError(f"{self.name}: M(q) is not symmetric, by {asymmetry:.2g}")
+        if (smallest := float(np.linalg.eigvalsh(mass)[0])) <= 0.0:
             raise ModelError(
-                f"{dae.name}: M(q) is not positive definite at the nominal configuration: "
+                f"{self.name}: M(q) is not positive definite at the nominal configuration: "
                 f"smallest eigenvalue {smallest:.2g}. A link without inertia cannot be moved by a "
                 "force; give it mass, or weld it"
             )

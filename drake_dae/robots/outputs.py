@@ -10,10 +10,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
 from drake_dae.dae import Signal, as_expression
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.links.links import Kinematics, Links, position_index
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots.constraint import Constraint, ConstraintSet
+from drake_dae.robots.links import Kinematics, Links, position_index
+from drake_dae.robots.surface import Vector
 from drake_dae.trace.expressions import length_of, result_of
 
 
@@ -79,8 +78,8 @@ class AxisCoordinates(PositionOutput):
     components: str
 
     def __post_init__(self) -> None:
-        check_axes("components", self.components)
         _check_axis(self.axis)
+        check_axes("components", self.components)
 
     def expression(self, links: Links) -> ca.SX:
         column = links.rotation(self.frame)[:, "xyz".index(self.axis)]
@@ -139,14 +138,13 @@ class TiltFromNormal(PositionOutput):
     def __post_init__(self) -> None:
         _check_axis(self.axis)
         others = "xyz".replace(self.axis, "")
-        if self.components:
-            check_axes("components", self.components)
+        object.__setattr__(self, "components", self.components or others)
+        check_axes("components", self.components)
         if self.axis in self.components:
             raise ModelError(
                 f"components must be of {' and '.join(others)}, the axes normal to {self.axis}, "
                 f"got '{self.components}'"
             )
-        object.__setattr__(self, "components", self.components or others)
 
     def expression(self, links: Links) -> ca.SX:
         touch = self.contact.touch(links)
@@ -221,34 +219,12 @@ class ForceOutput(ABC):
     """
 
     @abstractmethod
-    def expression(
-        self, constraints: ConstraintSet, kinematics: Kinematics, constraint_force: ca.SX
-    ) -> ca.SX:
+    def expression(self, constraints: ConstraintSet, kinematics: Kinematics, force: ca.SX) -> ca.SX:
         """The components, shape (k, 1), written in the robot's kinematics and lambda."""
 
     @abstractmethod
     def signals(self, constraints: ConstraintSet) -> tuple[Signal, ...]:
         """Names and units of the components."""
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class NamedForce(ForceOutput):
-    """A single constraint force: a row of the identity. In lists, its name is enough.
-
-    Attributes:
-        name: The name of the constraint force.
-    """
-
-    name: str
-
-    def expression(
-        self, constraints: ConstraintSet, kinematics: Kinematics, constraint_force: ca.SX
-    ) -> ca.SX:
-        return constraint_force[constraints.place(self.name)]
-
-    def signals(self, constraints: ConstraintSet) -> tuple[Signal, ...]:
-        return (constraints.force_signals[constraints.place(self.name)],)
 
 
 @checked(ModelError)
@@ -268,10 +244,8 @@ class ForceCombination(ForceOutput):
         if not any(self.weights.values()):
             raise ModelError(f"'{self.name}' needs at least one weight that is not zero")
 
-    def expression(
-        self, constraints: ConstraintSet, kinematics: Kinematics, constraint_force: ca.SX
-    ) -> ca.SX:
-        parts = [w * constraint_force[constraints.place(n)] for n, w in self.weights.items()]
+    def expression(self, constraints: ConstraintSet, kinematics: Kinematics, force: ca.SX) -> ca.SX:
+        parts = [w * force[constraints.place(n)] for n, w in self.weights.items()]
         return ca.sum1(ca.vertcat(*parts))
 
     def signals(self, constraints: ConstraintSet) -> tuple[Signal, ...]:
@@ -317,11 +291,9 @@ class Squeeze(ForceOutput):
         if self.first == self.second:
             raise ModelError(f"a squeeze is between two constraints, both are '{self.first}'")
 
-    def expression(
-        self, constraints: ConstraintSet, kinematics: Kinematics, constraint_force: ca.SX
-    ) -> ca.SX:
+    def expression(self, constraints: ConstraintSet, kinematics: Kinematics, force: ca.SX) -> ca.SX:
         (p_i, f_i), (p_j, f_j) = (
-            constraints.force_on(self.frame, name, kinematics, constraint_force)
+            constraints.force_on(self.frame, name, kinematics, force)
             for name in (self.first, self.second)
         )
         apart = p_j - p_i
@@ -336,8 +308,8 @@ def as_force_outputs(
 ) -> tuple[ForceOutput, ...]:
     """The force outputs of a list: a name is that force, None are all forces."""
     if forces is None:
-        return tuple(NamedForce(signal.name) for signal in constraints.force_signals)
-    outputs = tuple(NamedForce(f) if isinstance(f, str) else f for f in forces)
+        forces = [signal.name for signal in constraints.force_signals]
+    outputs = tuple(ForceCombination({f: 1.0}, f) if isinstance(f, str) else f for f in forces)
     names = [signal.name for output in outputs for signal in output.signals(constraints)]
     twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
     if twice:
@@ -361,6 +333,5 @@ def force_rows(outputs: Sequence[ForceOutput], constraints: ConstraintSet, links
 
 
 def _check_axis(axis: str) -> None:
-    if len(axis) != 1:
+    if axis not in ("x", "y", "z"):
         raise ModelError(f"axis must be one of x, y, z, got '{axis}'")
-    check_axes("axis", axis)

@@ -1,57 +1,37 @@
 """Configurations (58) and static balance: two problems for Newton's method."""
 
-from functools import cached_property
-
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.links.links import Links
-from drake_dae.trace.factorization import Factorization
+from drake_dae.robots.links import Links
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps
-
-MOST = 1000
-"""The largest product of unknowns and squared equations whose Newton step is traced."""
+from drake_dae.trace.numerics import NewtonModel, newton, once, shortest_steps
 
 
 class StaticPlacement:
     """The equations 0 = phi(q), h_1(q) = z_1, to be solved for q: q = psi(z_1) of (58)."""
 
     def __init__(self, dae: DaeSystem, q: ca.SX, phi: ca.SX, h_1: ca.SX) -> None:
-        of_outputs = ca.SX.sym("of outputs", dae.parameter_symbol.numel())
-        h_1 = ca.substitute(h_1, dae.parameter_symbol, of_outputs)
-        p, slopes = dae.parameter_symbol, {"J": ca.jacobian(phi, q), "P": ca.jacobian(h_1, q)}
-        self._name = f"{dae.name} positions"
-        self._inputs = {"q": q, "parameters": p, "parameters of outputs": of_outputs}
-        self._outputs = {"phi": phi, "h_1": h_1, **slopes}
-        self._robot, rows = dae.name, phi.numel() + h_1.numel()
-        self._is_traced = 0 < rows <= q.numel() and rows**2 * q.numel() <= MOST
-        self._function = TracedFunction(self._name, self._inputs, self._outputs)
-
-    @cached_property
-    def _step(self) -> TracedFunction:
-        """The Newton step from any point by the matrix of q, to all outputs; the shortest one."""
-        phi, h_1, J, P = self._outputs.values()
-        q, at = self._inputs["q"], ca.SX.sym("at", self._inputs["q"].numel())
-        wanted = ca.SX.sym("outputs", h_1.numel())
-        factors = Factorization(ca.vertcat(J, P).T)
-        step = factors.shortest(ca.substitute(ca.vertcat(phi, h_1 - wanted), q, at))
-        inputs = {**self._inputs, "outputs": wanted, "at": at}
-        return TracedFunction(self._name, inputs, {"step": -step}, factors.pivot)
+        p, of_outputs = dae.parameter_symbol, ca.SX.sym("p", dae.parameter_symbol.numel())
+        h_1 = ca.substitute(h_1, p, of_outputs)
+        self._robot = dae.name
+        self._function = TracedFunction(
+            f"{dae.name} positions",
+            {"q": q, "parameters": p, "parameters of outputs": of_outputs},
+            {"phi": phi, "h_1": h_1, "J": ca.jacobian(phi, q), "P": ca.jacobian(h_1, q)},
+        )
 
     def solve(
         self, outputs: FloatArray, guess: FloatArray, parameters: FloatArray, of_outputs: FloatArray
     ) -> FloatArray:
-        """A solution near a guess; InconsistentStateError if there is none. Nothing is checked.
+        """A solution near a guess for the first components of z_1; the others are free.
 
-        `outputs` are the first components of z_1, the others are free; `parameters` are the values
-        of all parameters for phi, `of_outputs` those for h_1.
+        `parameters` are the values of all parameters for phi, `of_outputs` those for h_1.
         """
         count = outputs.size
-        is_traced = self._is_traced and count == self._outputs["h_1"].numel()
         evaluated = once(lambda q: self._function(q, parameters, of_outputs))
 
         def residual(q: FloatArray) -> FloatArray:
@@ -59,17 +39,6 @@ class StaticPlacement:
             return np.concatenate([phi, h_1[:count] - outputs])  # (58)
 
         def linearize(q: FloatArray) -> NewtonModel | None:
-            if is_traced:
-                step = self._step
-                first = step.evaluate(q, parameters, of_outputs, outputs, q)[0].copy()
-
-                def step_from(x: FloatArray) -> FloatArray:
-                    if x is q:
-                        return first
-                    return step.evaluate(q, parameters, of_outputs, outputs, x)[0].copy()
-
-                if step.is_valid:
-                    return NewtonModel(step_from, True)
             _, _, J, P = evaluated(q)
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)
@@ -134,15 +103,12 @@ class StaticBalance:
         """The state at rest, lambda, and the largest remaining residual, at positions, for z_2."""
         evaluated = once(lambda unknown: self._function(q, forces, unknown, parameters))
 
-        def residual(unknown: FloatArray) -> FloatArray:
-            return evaluated(unknown)[0]
-
         def linearize(unknown: FloatArray) -> NewtonModel | None:
             balance, gradient, _ = evaluated(unknown)
             gradient = gradient.reshape(balance.size, -1)
             # Currents and forces differ by orders of magnitude.
             scale = np.maximum(np.linalg.norm(gradient, axis=0), np.finfo(float).tiny)
-            steps = shortest_steps(gradient / scale, residual)
+            steps = shortest_steps(gradient / scale, lambda x: evaluated(x)[0])
             if steps is None:
                 return None
             return NewtonModel(lambda x: steps.step(x) / scale, steps.is_regular)

@@ -21,11 +21,11 @@ from drake_dae.errors import (
     WiringError,
 )
 from drake_dae.running.judgement import unit_sizes
-from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.control.drives import ControlLimits
-from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.trace.round_off import equilibration, smallest_singular_value
+from drake_dae.systems.applied_control import ControlLimits
+from drake_dae.systems.controller import Controller
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.references import ReferenceGenerator
+from drake_dae.trace.numerics import equilibration, smallest_singular_value
 
 # The smallest singular value of A(x) or B(x), rows and columns scaled by their usual sizes, below
 # which it is why a run ends: steps become too short long before it is zero. NEARLY is the same at

@@ -33,7 +33,7 @@ from drake_dae.running.c_code import (
     written,
 )
 from drake_dae.running.merged_run import upstream
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plant import Plant
 from drake_dae.trace.compiled import generate, renamed, without_branches
 
 CONTROL = "control"  # The name of a controller's output port and a plant's input port.

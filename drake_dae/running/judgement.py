@@ -12,7 +12,7 @@ from drake_dae.analysis import LimitKind, SignalRange, count_of
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record
-from drake_dae.systems.control.contract import PhaseChange
+from drake_dae.systems.controller import PhaseChange
 
 SHARE = 0.01  # The default tolerance, as a share of the range of references in an output's unit.
 GRACE = 0.1  # The permitted delay relative to the prediction, as a share of the run.

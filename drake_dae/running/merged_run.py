@@ -30,7 +30,7 @@ from drake_dae.blocks.compose import Composed, Leaves, Port, compose, leaf_port
 from drake_dae.blocks.primitives import symbolic_block
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.errors import DrakeDaeError
-from drake_dae.systems.plants.contract import plants_in
+from drake_dae.systems.plant import plants_in
 from drake_dae.trace.compiled import Compiled
 
 EVERY = 32  # The number of steps after which the context of the diagram as wired gets the results.

@@ -20,7 +20,7 @@ from drake_dae.blocks.failures import (
     off_manifold,
     spoilt_step,
 )
-from drake_dae.blocks.interpreted import LOOKED, run_interpreted
+from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
 from drake_dae.blocks.stepping import Look, Run, RunEnding, RunProblem, StepSettings
 from drake_dae.blocks.trials import PACE_STEPS
@@ -37,13 +37,14 @@ from drake_dae.running.diagnosis import IN_ROLLOUT, MANY, RunWatch, warn_if_stif
 from drake_dae.running.merged_run import NO_EVENTS, MergedRun
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, Seed, program_of
 from drake_dae.running.simulate import check_config
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plant import Plant
 from drake_dae.trace.compiled import Compiled, check_choice
 
 SEVERAL = 8  # The least number of runs that go side by side; fewer give the bits of single runs.
 STAGES_PER_SECOND = 500  # An estimate of the evaluations in a simulated second under error control.
 # The time that runs side by side save per evaluation, over that of an interpreted one.
 FASTER = 0.05
+LOOKED = 64  # The rows after which a run by Drake looks whether it diverges, or is to stop.
 # The most failed runs of one call whose cause is looked for, which takes up to a second each.
 DIAGNOSED = 8
 

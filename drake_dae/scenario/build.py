@@ -1,55 +1,76 @@
-"""A scenario as a closed loop."""
+"""A scenario as a closed loop: for Drake's Simulator, for rollouts, and for pages."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, cast
+from math import ceil, floor
+from typing import Any, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
+from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context
 
+from drake_dae import dae
 from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.blocks.block import NOTHING, Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae import (
-    ConstraintStructure,
-    DaeSystem,
-    Structure,
-    TrackingLaw,
-    find_constraint_structure,
-    find_structure,
-    outputs_named,
-    with_disturbance,
+from drake_dae.dae import ConstraintStructure, DaeSystem, Structure, TrackingLaw
+from drake_dae.dae.disturbance import estimated_within
+from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop, wire_loop
+from drake_dae.diagrams.parts import (
+    ENCODER_NOISE,
+    LoopSettings,
+    encoder_seed,
+    hold_sampling,
+    make_sensor,
 )
-from drake_dae.dae.beyond.disturbance import estimated_within
-from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
-from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
-from drake_dae.errors import AssumptionError, ModelError, ScenarioError
-from drake_dae.references import Reference
-from drake_dae.robots import RobotModel, ScaledForce
+from drake_dae.diagrams.record import Record, RecordAfter
+from drake_dae.errors import (
+    AssumptionError,
+    DrakeDaeError,
+    ModelError,
+    ScenarioError,
+    SimulationError,
+)
+from drake_dae.pictures.page.controls import PUSH
+from drake_dae.references import ConstantReference, Reference
+from drake_dae.robots import KnownWrench, PointOnSurface, RobotModel, ScaledForce
+from drake_dae.running.diagnosis import DivergenceWatch
+from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.estimated import estimates_all, with_all_estimated, with_friction_estimated
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.gains import advised
+from drake_dae.scenario.gains import (
+    advised,
+    estimates_all,
+    with_all_estimated,
+    with_friction_estimated,
+)
 from drake_dae.scenario.model import (
     completed_model,
     exogenous_references,
     references_of,
     scenario_structure,
 )
-from drake_dae.scenario.parts import Poles, ScenarioTask
-from drake_dae.scenario.robot_file.reading import RobotLinks
+from drake_dae.scenario.parts import Poles
+from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
-from drake_dae.systems.control.contract import Controller, Derived
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.force_sensor import ForceSensor
-from drake_dae.systems.task.contacts import open_contact
-from drake_dae.systems.task.controller import TaskController
+from drake_dae.systems.controller import Controller, Derived
+from drake_dae.systems.opening_contact import open_contact
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.task_controller import TaskController
+
+# The rows of a record under error control, after the first; and the most rows of fixed steps: a
+# larger record takes gigabytes.
+ROWS, MOST_ROWS = 1000, 1e7
+# The time by the clock in s between checks of a running rollout for divergence; and the fraction of
+# a step within which two times are equal.
+PERIOD, SAME = 0.2, 1e-6
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -85,7 +106,12 @@ def build_completed(
     drawn = {"scene_graph": (scene_graph := SceneGraph()), "meshcat": meshcat}
     completed, model, structure = completed_model(scenario, scene_graph, robot=robot)
     if not model.dae.num_controls:
-        return completed, _mechanism(completed.scenario, model, **drawn)
+        for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
+            if getattr(scenario, key):
+                raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
+        free = dae.find_constraint_structure(model.dae)
+        plant = make_plant(completed.scenario, model, free)
+        return completed, wire_loop(plant, _NoController(free), **drawn)
     if structure is None:
         try:
             structure = scenario_structure(model)
@@ -96,7 +122,8 @@ def build_completed(
 
     # The gains, with what belongs to them.
     chosen = advised(completed.scenario, model, structure)
-    scenario, task, sensors = chosen.scenario, chosen.scenario.task, chosen.scenario.sensors
+    scenario, notes = chosen.scenario, (*completed.notes, *chosen.notes)
+    task, sensors = scenario.task, scenario.sensors
 
     # The plant. In an ideal one a payload is a further body, and the course of a disturbance an
     # exogenous signal; the law knows neither. Masses and forces are parameters, set at the start.
@@ -117,7 +144,7 @@ def build_completed(
         plant = make_plant(scenario, model, structure)
 
     # The law, of a model with a disturbance if there is an estimator of it; and what it follows.
-    of_law, references, exogenous = scenario, list[Reference](), []
+    of_law = scenario
     if estimates_all(scenario, model):
         of_law = with_all_estimated(scenario, model)
         try:
@@ -125,10 +152,11 @@ def build_completed(
         except (AssumptionError, ScenarioError) as error:  # No run is refused for it.
             of_law = with_friction_estimated(scenario, model)
             law = tracking_law(of_law, model, structure)
-            note = f"only friction of contacts is estimated, no loads, tilts and joints: {error}"
-            completed = Completed(completed.scenario, (*completed.notes, note))
+            text = "only friction of contacts is estimated, no loads, tilts and joints"
+            notes = *notes, f"{text}: {error}"
     else:
         law = tracking_law(scenario, model, structure)
+    references, exogenous = list[Reference](), list[Reference]()
     if task is None:
         names = [signal.name for signal in law.system.output_signals]
         references = references_of(scenario, names, law.layout.reference_degrees)
@@ -137,9 +165,8 @@ def build_completed(
 
     # The parts between plant and law; errors get the key of the part.
     sensor, limits = None, None
-    if sensors.force is not None:
+    if (force := sensors.force) is not None:
         with at("sensors.force"):
-            force = sensors.force
             errors = force.bias, force.noise_deviation, force.drift
             lags = force.time_constant, force.sample_period
             sensor = ForceSensor(model.dae.num_constraints, *lags, *errors)
@@ -163,24 +190,31 @@ def build_completed(
     period = settings.period(plant.time_step)
     if settings.sampling is not None:
         with at("sampling"):
-            hold_before(plant, settings.sampling)
+            hold_sampling(plant, settings.sampling)
     if settings.encoders is not None:
         with at("sensors.encoders"):
             make_sensor(plant, settings.encoders, period)
     with at("judgement.tolerances"):
-        outputs_named(scenario.judgement.tolerances, model.dae.output_signals)
+        dae.places_of("output", scenario.judgement.tolerances, model.dae.output_signals)
 
-    # The controller and the loop.
+    # The controller and the loop: with a task the law in contact, and one with the contact open.
     if task is not None:
+        points, gains = opening_contact(scenario, model), task.gains or scenario.law.gains
+        assert gains is not None  # advised.
+        names = [signal.name for point in points for signal in point.force_signals]
+        with at("task.gains" if task.gains else "law.gains"):
+            free = dae.find_structure(open_contact(law.system, names))
+            of_free = TrackingLaw(free.system, gains.design(), structure=free, latency=law.latency)
         with at("task"):
-            controller = _task_controller(scenario, task, model, law, period)
-            loop = wire_loop(plant, controller, None, settings, **drawn)
-    else:
-        keys = ["estimator"] if scenario.estimator is not None else []
-        keys += ["sensors.force"] if sensor is not None or keys else []
-        with at(" or ".join(keys) or "start.positions"):
-            loop = make_closed_loop(plant, law, references, settings, **drawn)
-    return Completed(scenario, (*completed.notes, *chosen.notes)), loop
+            # The noise of the sum over the points.
+            made = task.make(sensors.force_noise * len(points) ** 0.5)
+            controller = TaskController(made, law, of_free, sample_period=period or 1e-3)
+            return Completed(scenario, notes), wire_loop(plant, controller, None, settings, **drawn)
+    keys = ["estimator"] if scenario.estimator is not None else []
+    keys += ["sensors.force"] if sensor is not None or keys else []
+    with at(" or ".join(keys) or "start.positions"):
+        loop = make_closed_loop(plant, law, references, settings, **drawn)
+    return Completed(scenario, notes), loop
 
 
 @at("start.positions")
@@ -193,13 +227,9 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
     """The law of a scenario, after `advised`; of a system with a disturbance for an estimator."""
     settings, is_measured = scenario.law, scenario.sensors.force is not None
     damping, estimator = settings.constraint_damping, scenario.estimator
-    keys = ["sensors.force", "law.gains"] if is_measured else ["law.gains"]
-    keys += [f"law.{key}" for key in ("constraint_damping", "integral") if getattr(settings, key)]
-    if settings.contact_stiffness is not None:
-        keys = ["law.contact_stiffness", *keys]
-        if scenario.task is not None:
-            text = "is not for scenarios with `task`; leave it out"
-            raise ScenarioError(("law.contact_stiffness", text))
+    if settings.contact_stiffness is not None and scenario.task is not None:
+        text = "is not for scenarios with `task`; leave it out"
+        raise ScenarioError(("law.contact_stiffness", text))
     if estimator is not None:
         if estimator.rate is None:
             text = "needed, since no gains are computed; leave `law.gains` out with Drake's contact"
@@ -209,26 +239,26 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             raise ScenarioError(("estimator", text))
         known, names = [p.name for p in model.dae.parameters], estimator.parameters or []
         for name in {*names} - {*known}:
-            hint = "; give the constraint friction: 0.0 if it is unknown" * name.endswith(
-                ".friction"
-            )
-            text = f"parameters: {unknown_name('parameter', name, known)}{hint}"
-            raise ScenarioError(("estimator", text))
+            rough = "; give the constraint friction: 0.0 if it is unknown"
+            text = f"parameters: {unknown_name('parameter', name, known)}"
+            raise ScenarioError(("estimator", text + rough * name.endswith(".friction")))
         with at("estimator.parameters"):
             velocities = [signal.name for signal in model.links.velocity_signals]
-            observed = with_disturbance(model.dae, velocities, names)
+            observed = dae.with_disturbance(model.dae, velocities, names)
             friction = {contact.friction for contact in model.dae.contacts}
             others = [p for p in model.dae.parameters if p.name in {*names} - friction]
             estimated_within(others, estimator.ranges)
         with at("estimator"):
-            structure = find_structure(observed)
+            structure = dae.find_structure(observed)
     # The mean time from a sample to the moment when its control acts, for rigid joints. A plant
     # that steps by h damps with the speed at the end of each step: h / 2 later than the mean, and h
     # later than a law without sampling, which acts at each step.
     sampling, material = scenario.sampling, scenario.plant.material
     step = 0.0 if material is None else material.time_step
     latency = step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
-    with at(" or ".join(keys)):
+    more = ("contact_stiffness", "constraint_damping", "integral")
+    keys = ["sensors.force"] * is_measured + ["law.gains"]
+    with at(" or ".join([*keys, *(f"law.{key}" for key in more if getattr(settings, key))])):
         return TrackingLaw(
             structure.system,
             (settings.gains or Poles(all=[-4.0])).design(),
@@ -258,34 +288,6 @@ def check_task(scenario: Scenario) -> None:
         problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if problems:
         raise ScenarioError(*problems)
-
-
-def _task_controller(
-    scenario: Scenario, task: ScenarioTask, model: RobotModel, law: TrackingLaw, period: float
-) -> TaskController:
-    """The controller of a task: the law in contact, and one with the contact open."""
-    points = opening_contact(scenario, model)
-    forces = [signal.name for point in points for signal in point.force_signals]
-    free_system, gains = open_contact(law.system, forces), task.gains or scenario.law.gains
-    assert gains is not None  # advised.
-    with at("task.gains" if task.gains else "law.gains"):
-        structure = find_structure(free_system)
-        free_law = TrackingLaw(
-            free_system, gains.design(), structure=structure, latency=law.latency
-        )
-    # The noise of the sum over the points.
-    noise = scenario.sensors.force_noise * len(points) ** 0.5
-    return TaskController(task.make(noise), law, free_law, sample_period=period or 1e-3)
-
-
-def _mechanism(scenario: Scenario, model: RobotModel, **drawn: Any) -> ClosedLoop:
-    """The loop of a mechanism that nothing drives."""
-    for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
-        if getattr(scenario, key):
-            raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
-    structure = find_constraint_structure(model.dae)
-    plant = make_plant(scenario, model, structure)
-    return wire_loop(plant, _NoController(structure), **drawn)
 
 
 class _NoController(TracedSystem, Controller):
@@ -327,3 +329,160 @@ class _NoLaw:
     def __getattr__(self, name: str) -> Any:
         text = f"robot.actuators is [], and there is no law with {name}; simulate runs it"
         raise ModelError(text)
+
+
+def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
+    """A scenario with a plant that rollouts support, and a remark if this changed the plant."""
+    plant = scenario.plant.rolled
+    if plant is scenario.plant:
+        return scenario, ""
+    # Drake's contact has no viscous friction.
+    viscous = [c.name for c in scenario.constraints if getattr(c, "viscous_friction", None)]
+    none = {f"{name}.viscous_friction": 0.0 for name in viscous}
+    plant = replace(plant, parameters={**plant.parameters, **none})
+    return replace(scenario, plant=plant), (
+        f"a !{type(plant).__name__} runs in place of !{type(scenario.plant).__name__}: "
+        "the same equations of contact, traced. Drake's solver stops at a relative residual of "
+        "1e-6, and joints stop at their limits in Drake's plant alone"
+    )
+
+
+def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
+    """The times of the rows of a rollout's record, in s: equidistant, or those of fixed steps."""
+    config, duration = scenario.integrator, scenario.duration
+    start, end = config.start_time, config.start_time + duration
+    fixed = time_step or (0.0 if config.use_error_control else config.max_step_size)
+    if fixed and duration / fixed > MOST_ROWS:
+        raise ModelError(
+            f"steps of {fixed:g} s make {duration / fixed:.2g} rows for {duration:g} s; a rollout "
+            f"keeps at most {MOST_ROWS:g}"
+        )
+    if time_step:
+        first, after = floor(start / time_step + SAME) + 1, ceil(end / time_step - SAME)
+        return np.concatenate([[start], time_step * np.arange(first, after), [end]])
+    rows = max(1, ceil(duration / fixed - 0.01)) if fixed else ROWS
+    times: FloatArray = start + np.linspace(0.0, duration, rows + 1)
+    return times
+
+
+def roll_scenario(
+    scenario: Scenario,
+    loop: ClosedLoop,
+    context: Context,
+    lasting: float | None = None,
+    look: Callable[[RecordAfter], bool] = lambda record: False,
+) -> Rollout:
+    """Runs a scenario by `rollout`; a diverging run ends, as by `simulate`."""
+    start, parameters = start_values(loop, context)
+    sensors, seeds = scenario.sensors, dict[str, int]()
+    if sensors.force is not None:
+        seeds["force_noise"] = sensors.force.seed
+    if sensors.encoders is not None:
+        seeds[ENCODER_NOISE] = encoder_seed(sensors.encoders.seed)
+    watch, due = DivergenceWatch(loop.plant, scenario.duration), time.perf_counter() + PERIOD
+    seen: float | None = None
+    failure: SimulationError | None = None
+
+    def diverges(rows: Record, is_last: bool = False) -> bool:
+        nonlocal seen, due, failure
+        due = time.perf_counter() + PERIOD
+        if not scenario.judgement.may_diverge and failure is None and rows.time.size:
+            seen = float(rows.time[-1])
+            try:
+                watch.look(rows, is_last=is_last)
+            except SimulationError as error:
+                failure = error
+        return failure is not None
+
+    def watched(record: RecordAfter) -> bool:
+        return (time.perf_counter() > due and diverges(record(seen))) or look(record)
+
+    times = rollout_times(scenario, loop.plant.time_step)
+    more: dict[str, Any] = {"config": scenario.integrator, "seeds": [seeds], "lasting": lasting}
+    (rollout,) = run_loop(loop, start, parameters, times, look=watched, **more)
+    if diverges(rollout.record.after(seen), is_last=rollout.failure is None):
+        assert failure is not None
+        rollout = rollout.ended(failure)
+    return diagnosed(loop, rollout, scenario.integrator)
+
+
+class Commanded(NamedTuple):
+    """A loop that a person can change while it runs, its start, and why some changes are none."""
+
+    loop: ClosedLoop
+    context: Context
+    left_out: tuple[str, ...]
+
+
+@checked(lambda text: ScenarioError(("", text)))
+def build_commanded(scenario: Scenario) -> Commanded:
+    """Builds a loop with `CommandedReferences`, surfaces that can be moved, and wrenches on links.
+
+    Without commands the loop behaves as in the scenario: surfaces are fixed, and wrenches and
+    additional friction are zero. Signals for which a task waits are inputs of the diagram.
+    """
+    scenario, remark = for_rollout(scenario)
+    if scenario.plant.carries:
+        text = "Drake's hydroelastic contact cannot be traced: take a !CompliantContact instead"
+        raise ScenarioError(("plant", text))
+    told = [f"Drake's plant: {remark}"] if remark else []
+    extended, left_out = scenario, [*told]
+    for name, add in _CHANGES.items():
+        try:
+            extended = add(extended)
+        except ModelError as error:
+            left_out.append(f"{name}: none, since {error}")
+    try:
+        completed, loop = build_completed(extended, commanded=True)
+    except DrakeDaeError as error:
+        completed, loop = build_completed(scenario, commanded=True)  # Its own errors come first.
+        left_out = [*told, *(f"{name}: {error}" for name in _CHANGES)]
+    # The original exogenous signals decide whether the loop starts at rest.
+    initial = replace(completed.scenario, exogenous=scenario.exogenous)
+    return Commanded(loop, start_scenario(initial, loop), tuple(left_out))
+
+
+def _with_friction(scenario: Scenario) -> Scenario:
+    """Adds a coefficient of friction of 0 to frictionless contacts of ideal plants."""
+    points = [c for c in scenario.constraints if isinstance(c, PointOnSurface)]
+    bare = [point for point in points if point.friction is None]
+    if not bare or scenario.plant.material is not None:  # Which has the friction of contacts.
+        return scenario
+    if scenario.actuation:
+        raise ModelError("the law would differentiate it; give the constraint a friction")
+    rough = [replace(c, friction=0.0) if c in bare else c for c in scenario.constraints]
+    return replace(scenario, constraints=rough)
+
+
+def _with_moving_surfaces(scenario: Scenario) -> Scenario:
+    """Makes the positions of surfaces constant exogenous signals."""
+    if scenario.plant.material is not None:
+        return scenario  # Of a compliant contact they are parameters of the plant alone.
+    if scenario.estimator is not None:
+        raise ModelError(
+            "an estimator does not know how a surface moves, and an ideal contact needs a law that "
+            "does; with `plant: !CompliantContact` they are dragged"
+        )
+    points = [c for c in scenario.constraints if isinstance(c, PointOnSurface)]
+    places = [c.parameters[0] for c in points if c.parameters[0].name not in scenario.exogenous]
+    still: dict[str, Any] = {p.name: [*map(ConstantReference, p.value.tolist())] for p in places}
+    return replace(scenario, exogenous={**scenario.exogenous, **still})
+
+
+def _with_pushes(scenario: Scenario) -> Scenario:
+    """Adds a zero wrench to each movable link."""
+    robot, pushes = scenario.robot, []
+    plant = robot_links(robot, SceneGraph(), drawn=False)[0].plant
+    for body in (plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())):
+        if plant.GetVisualGeometriesForBody(body) and not plant.IsAnchored(body):
+            name = body.scoped_name().get_full()
+            pushes.append(KnownWrench(name, name=PUSH + name))
+    return replace(scenario, robot=replace(robot, known_forces=[*robot.known_forces, *pushes]))
+
+
+_CHANGES: dict[str, Callable[[Scenario], Scenario]] = {
+    "friction of the plant": _with_friction,
+    "surfaces that are dragged": _with_moving_surfaces,
+    "links that are pushed": _with_pushes,
+}
+"""What a person may change beside references, and what it adds to a scenario."""

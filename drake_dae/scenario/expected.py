@@ -1,7 +1,7 @@
 """What is to be expected of a law on contact that gives way: errors, touches, and jams."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from math import inf, isfinite, pi
 
@@ -10,11 +10,11 @@ import numpy as np
 from scipy.linalg import expm
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import SensedContact, SensorNoise, Structure, ZeroDynamics
-from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR, RAMP, Part
-from drake_dae.dae.beyond.one_direction import DirectionGains
+from drake_dae.dae import SensedContact, SensorNoise, Structure
+from drake_dae.dae.advised_gains import EVERY, MODEL_ERROR, RAMP, Part
 from drake_dae.dae.law_model import damping_gains
 from drake_dae.dae.margins import ContactMargins
+from drake_dae.dae.one_direction import DirectionGains
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.references import Reference
@@ -22,27 +22,19 @@ from drake_dae.robots import RobotModel, velocities_are_rates
 from drake_dae.running.judgement import OutputQuality
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.form import at
-from drake_dae.scenario.model import exogenous_references, reference_and_start
+from drake_dae.scenario.model import motion_along
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.sensing.encoders import Encoders
-from drake_dae.systems.task.automaton import SMOOTH, fading
-from drake_dae.systems.task.phases import Approach, Press
+from drake_dae.systems.automaton import SMOOTH, fading
+from drake_dae.systems.phases import Approach, Press
+from drake_dae.systems.sensors import Encoders
 
-PATCH_FORCE = 10.0
-"""The force in N at which the stiffness of a hydroelastic patch is evaluated."""
-
-_BEYOND = 2.0
-"""A run is reported whose errors exceed the stated ones by this factor."""
-
-_STATES = 33
-"""The number of states along the references at which friction is compared with what jams."""
-
-_DEVELOPED = 10.0
-"""The factor of velocities, so that friction of the model is that of a contact that slides."""
-
-_PERIODS = 3
-"""The number of oscillations of the contact after the force of a touch has reached its goal."""
+PATCH_FORCE = 10.0  # The force in N at which the stiffness of a hydroelastic patch is evaluated.
+_BEYOND = 2.0  # A run is reported whose errors exceed the stated ones by this factor.
+_PERIODS = 3  # The oscillations of the contact after the force of a touch has reached its goal.
+# The number of states along the references at which friction is compared with what jams; and the
+# factor of their velocities, so that friction of the model is that of a contact that slides.
+_STATES, _DEVELOPED = 33, 10.0
 
 
 def timing(scenario: Scenario) -> tuple[float, int]:
@@ -55,12 +47,8 @@ def timing(scenario: Scenario) -> tuple[float, int]:
 
 def moved_points(model: RobotModel) -> list[str]:
     """The names of outputs that are coordinates of points."""
-    return [
-        signal.name
-        for output in model.outputs
-        for signal in output.signals(model.links)
-        if signal.unit == "m"
-    ]
+    signals = (s for output in model.outputs for s in output.signals(model.links))
+    return [signal.name for signal in signals if signal.unit == "m"]
 
 
 def rounded(value: float) -> float:
@@ -112,36 +100,29 @@ def sensed_contact(
 def stated_errors(
     scenario: Scenario, model: RobotModel, structure: Structure
 ) -> tuple[float, float] | None:
-    """The rms errors of a point in m and of a contact force in N by the linear model.
+    """The rms errors of a point in m and of a force in N by the linear model of `advised_gains`.
 
-    It is that of `advised_gains`, of one direction, with the gains as they run: with the noise of
-    the sensors, an unknown force of `MODEL_ERROR` that appears every `EVERY` seconds, a reference
-    of the force that changes by `RAMP`, and the bias of the force sensor, which no law knows.
-    None without an estimator on a contact that gives way, in a task, and where gains are no
-    coefficients of points and forces.
+    With the gains as they run, the noise of the sensors, an unknown force, a changing reference,
+    and the bias of the force sensor, which no law knows. None where that model says nothing.
     """
-    law, estimator = scenario.law, scenario.estimator
-    material, gains = scenario.plant.material, law.gains
-    given = isinstance(gains, parts.Coefficients) and estimator is not None and estimator.rate
-    if not given or material is None or scenario.task is not None or not timing(scenario)[0]:
+    law, estimator, material = scenario.law, scenario.estimator, scenario.plant.material
+    if material is None or scenario.task is not None or not timing(scenario)[0]:
         return None
-    assert isinstance(gains, parts.Coefficients)
-    assert estimator is not None
-    assert estimator.rate is not None
+    if estimator is None or not estimator.rate or not isinstance(law.gains, parts.Coefficients):
+        return None
+    gains = law.gains.outputs
     pressing = {signal.name for signal in model.dae.constraint_input_signals}
-    of_points = [gains.outputs[name] for name in moved_points(model) if name in gains.outputs]
-    of_forces = [own for name, own in gains.outputs.items() if name in pressing]
+    of_points = [gains[name] for name in moved_points(model) if name in gains]
+    of_forces = [own for name, own in gains.items() if name in pressing]
     if not of_points or not of_forces or len(of_points[0]) not in (2, 3):
         return None
     sensed = sensed_contact(scenario, model, structure, material.stiffness_on(model, PATCH_FORCE))
-    damping = 0.0
-    if law.constraint_damping is not None:
-        damping = least_damping(structure, law.constraint_damping)
-    free = (0.0, *of_points[0])[-3:]
+    damped = least_damping(structure, law.constraint_damping)
+    integral, stiff, rate = (0.0, *of_points[0])[-3:]
     slow = estimator.force_rate or estimator.rate
     rates = (
-        DirectionGains((free[0], free[1], free[2]), 0.0, estimator.rate, estimator.state_rate),
-        DirectionGains((0.0, 0.0, damping), of_forces[0][0], slow, estimator.state_rate),
+        DirectionGains((integral, stiff, rate), 0.0, estimator.rate, estimator.state_rate),
+        DirectionGains((0.0, 0.0, damped), of_forces[0][0], slow, estimator.state_rate),
     )
     try:
         across, along = (Part.of(sensed, 0.0, own, bool(i)).error for i, own in enumerate(rates))
@@ -210,8 +191,10 @@ def _bias(scenario: Scenario) -> float:
     return 0.0 if force is None else float(np.max(np.abs(np.asarray(force.bias, dtype=float))))
 
 
-def least_damping(structure: Structure, damping: parts.Gains) -> float:
-    """The least damping of a constraint, in 1/s."""
+def least_damping(structure: Structure, damping: parts.Gains | None) -> float:
+    """The least damping of a constraint by the law, in 1/s."""
+    if damping is None:
+        return 0.0
     with at("law.constraint_damping"):
         return float(np.min(np.diag(damping_gains(structure, damping.design()).matrix)))
 
@@ -225,14 +208,8 @@ def jam(scenario: Scenario, model: RobotModel, structure: Structure, friction: f
     system = model.dae
     if scenario.task is not None or not (system.frictional_contacts and friction):
         return ""
-    begin = scenario.integrator.start_time
-    times = np.linspace(begin, begin + scenario.duration, _STATES)
     try:
-        reference, start = reference_and_start(scenario, model, structure)
-        exogenous = exogenous_references(scenario, system)
-        motion = ZeroDynamics(system, structure=structure).motion(
-            reference, times, start, exogenous=exogenous
-        )
+        motion = motion_along(scenario, model, structure, _STATES)
     except DrakeDaeError:  # Wrong references and starts are reported where they are used.
         return ""
     if not motion.times.size:
@@ -252,92 +229,62 @@ def jam(scenario: Scenario, model: RobotModel, structure: Structure, friction: f
     )
 
 
-@dataclass(frozen=True)
-class Touch:
-    """A compliant contact at the moment of a touch, and the law that acts on it.
+def with_lasting_touches(
+    task: ScenarioTask,
+    stiffness: float,
+    mobility: float,
+    damping: float,
+    force_gain: float,
+    period: float,
+    late: float,
+) -> tuple[ScenarioTask, str]:
+    """The task whose touches do not open again, and a sentence on their largest expected force.
 
-    Attributes:
-        stiffness: k, in N/m.
-        mobility: A = J M^-1 J^T along the normal, in 1/kg.
-        damping: c, the damping of the constraint by the law, in 1/s.
-        force_gain: K_i, the gain of the integral of the force's error, in 1/s.
-        period: T, the sample time, in s.
-        late: The longest time until the law reacts, in s.
+    The law holds for each sample T the force
+
+        u = lambda + K_i sum (lambda - F) T - c d' / A,    d'' = A (u - F),    F = k d,
+
+    with the depth d, and the reference lambda that fades from the felt force to the goal. F is
+    linear in the speed v of a touch, F = F_lambda(t) + v F_v(t), so that the largest v is the least
+    F_lambda / -F_v of all times with F_v < 0. An Approach without a speed has this one, or its
+    default if that is lower. The largest force is F + v (sqrt(k / A) + k t): the contact stops the
+    mass 1 / A of the tool, which moves on for the time t until the law reacts.
     """
+    k, A = stiffness, mobility
+    step = expm(period * np.array([[0.0, 1.0, 0.0], [-A * k, 0.0, A], [0.0, 0.0, 0.0]]))
 
-    stiffness: float
-    mobility: float
-    damping: float
-    force_gain: float
-    period: float
-    late: float
-
-    def lasting_speed(self, felt: float, goal: float, over: float) -> float:
-        """The largest speed of a touch, in m/s, after which the force does not fall to zero again.
-
-        The law holds for each sample the force
-
-            u = lambda + K_i sum (lambda - F) T - c d' / A,    d'' = A (u - F),    F = k d,
-
-        with the depth d and the reference lambda, fading from the felt force to the goal. F is
-        linear in the speed v of the touch, F = F_lambda(t) + v F_v(t), so that the largest v is the
-        least F_lambda / -F_v of all times with F_v < 0.
-
-        Args:
-            felt: The force at the touch, in N.
-            goal: The force to which the law presses, in N.
-            over: The duration of this, in s.
-        """
-        oscillation = 2.0 * pi / (self.stiffness * self.mobility) ** 0.5
-        times = np.arange(0.0, over + _PERIODS * oscillation, self.period)
-        powers = np.minimum(times / over, 1.0)[:, None] ** np.arange(6)
-        reference = goal + (felt - goal) * (powers @ fading(SMOOTH)[0])
-        of_reference = self._force(felt / self.stiffness, 0.0, reference)
-        of_speed = self._force(0.0, 1.0, 0.0 * reference)
-        opens = of_speed < 0.0
-        return float(np.min(of_reference[opens] / -of_speed[opens], initial=inf))
-
-    def _force(self, depth: float, rate: float, reference: FloatArray) -> FloatArray:
+    def force(depth: float, rate: float, reference: FloatArray) -> FloatArray:
         """F at each sample after a touch."""
-        k, A, period = self.stiffness, self.mobility, self.period
-        step = expm(period * np.array([[0.0, 1.0, 0.0], [-A * k, 0.0, A], [0.0, 0.0, 0.0]]))
-        waiting = [k * depth] * (round(self.late / period) - 1)
+        waiting = [k * depth] * (round(late / period) - 1)
         integral, forces = 0.0, np.empty(reference.size)
         for index, wanted in enumerate(reference.tolist()):
-            forces[index] = force = k * depth
-            waiting.append(wanted + self.force_gain * integral - self.damping * rate / A)
-            integral += period * (wanted - force)
+            forces[index] = felt = k * depth
+            waiting.append(wanted + force_gain * integral - damping * rate / A)
+            integral += period * (wanted - felt)
             depth, rate, _ = step @ [depth, rate, waiting.pop(0)]
         return forces
 
-    def slowed(self, task: ScenarioTask) -> ScenarioTask:
-        """The task with a `lasting_speed` for each Approach without a speed, or its default."""
-        phases = list(task.phases)
-        for index, (phase, then) in enumerate(pairwise(phases)):
-            if isinstance(phase, Approach) and phase.speed is None and isinstance(then, Press):
-                lasting = self._lasting(task, then)
-                phases[index] = replace(phase, speed=rounded(min(phase.speed_of_approach, lasting)))
-        return replace(task, phases=phases)
-
-    def _lasting(self, task: ScenarioTask, press: Press) -> float:
-        if isinstance(press.force, Reference):
-            return inf
-        return self.lasting_speed(task.contact_force, press.force, press.over)
-
-    def note(self, task: ScenarioTask) -> str:
-        """A sentence on the largest expected force of a touch, F + v (sqrt(k / A) + k t).
-
-        The contact of stiffness k stops the effective mass 1 / A of the tool from the speed v, and
-        in the time t until the law reacts the tool moves on by v t.
-        """
-        k, peaks = self.stiffness, []
-        approaches = [phase for phase in task.make().phases if isinstance(phase, Approach)]
-        for phase in approaches:
-            felt, speed = phase.felt(task.contact_force), phase.speed_of_approach
-            peak = felt + speed * ((k / self.mobility) ** 0.5 + k * self.late)
-            peaks.append((peak, speed, phase.name))
-        if not peaks:
-            return ""
-        peak, speed, name = max(peaks)
-        which = f" by {name}" if len(peaks) > 1 else ""
-        return f". A touch{which} at {speed:g} m/s is expected to stay below {peak:.3g} N"
+    phases, felt = list(task.phases), task.contact_force
+    for index, (phase, then) in enumerate(pairwise(phases)):
+        if not (isinstance(phase, Approach) and phase.speed is None and isinstance(then, Press)):
+            continue
+        speed = phase.speed_of_approach
+        if not isinstance(then.force, Reference):
+            times = np.arange(0.0, then.over + 2.0 * pi * _PERIODS / (k * A) ** 0.5, period)
+            powers = np.minimum(times / then.over, 1.0)[:, None] ** np.arange(6)
+            reference = then.force + (felt - then.force) * (powers @ fading(SMOOTH)[0])
+            of_speed, of_reference = force(0.0, 1.0, 0.0 * reference), force(felt / k, 0, reference)
+            opens = of_speed < 0.0
+            lasting = np.min(of_reference[opens] / -of_speed[opens], initial=inf)
+            speed = min(speed, float(lasting))
+        phases[index] = replace(phase, speed=rounded(speed))
+    task = replace(task, phases=phases)
+    reach = (k / A) ** 0.5 + k * late
+    approaches = [phase for phase in task.make().phases if isinstance(phase, Approach)]
+    peaks = [(p.felt(felt) + p.speed_of_approach * reach, p) for p in approaches]
+    if not peaks:
+        return task, ""
+    peak, phase = max(peaks, key=lambda pair: (pair[0], pair[1].speed_of_approach, pair[1].name))
+    which = f" by {phase.name}" if len(peaks) > 1 else ""
+    speed = phase.speed_of_approach
+    return task, f". A touch{which} at {speed:g} m/s is expected to stay below {peak:.3g} N"

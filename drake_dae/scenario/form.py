@@ -1,12 +1,14 @@
-"""Dataclasses as forms of plain data: read by pydantic, put by dotted keys, written, described.
+"""Dataclasses as forms of plain data, and plain data as YAML.
 
 A dataclass is its own form: its fields are keys, with its defaults and its checks, and its
-docstring explains them. A tag, as in `surface: !Sphere`, chooses among the classes of a family.
+docstring explains them. A tag, as in `surface: !Sphere`, chooses among the classes of a family; in
+plain data it is an entry "_tag" as Drake has it.
 """
 
 import inspect
 import json
 import re
+import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -14,33 +16,30 @@ from difflib import get_close_matches
 from functools import cache, cached_property
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NotRequired,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, ClassVar, Literal, NotRequired, TypeVar, Union
 
 import numpy as np
 import pydantic
+import yaml  # type: ignore[import-untyped]
 from casadi import SX
 from numpy.typing import ArrayLike
-from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError, core_schema
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from typing_extensions import TypedDict
 
-from drake_dae.arrays import brief
+from drake_dae.arrays import brief, can_be_written
 from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.robots import Pair, Vector
-from drake_dae.scenario.typed_yaml import TAG, first_name
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
 S = TypeVar("S")
+
+TAG = "_tag"
+"""The key under which a mapping holds its tag."""
+
+MOST_VALUES, MOST_TEXT = 100_000, 1_000_000
+"""The limits of a file; an alias counts as often as it is used. Shipped scenarios have 200 values
+in 4,000 characters."""
 
 
 @contextmanager
@@ -77,14 +76,6 @@ class Family:
         kinds = (int, float) if self.plain is float else (self.plain or (),)
         return "!" if isinstance(data, kinds) and not isinstance(data, bool) else ""
 
-    def check(self, data: Any) -> Any:
-        """Refuses what has no tag of a member and is not plain."""
-        if self.tag_of(data) not in (*self.members, "!"):
-            also = {str: "text, or ", float: "a number, or "}.get(self.plain or list, "")
-            tags = ", ".join(self.members)
-            raise ValueError(f"expected {also}one of {tags}, got {_shown(data)}")
-        return data
-
 
 @dataclass(frozen=True)
 class Key:
@@ -95,25 +86,16 @@ class Key:
     text: str
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """Annotates data like a hint; `convert` makes a value of it, `words` answer all other data."""
+def expected(words: str) -> pydantic.WrapValidator:
+    """What an annotation takes, in words, which answer all other data."""
 
-    words: str
-    hint: Any
-    convert: Callable[..., Any] = lambda value: value
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: pydantic.GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
-        more = pydantic.AfterValidator(self.convert), pydantic.WrapValidator(self._read)
-        return handler.generate_schema(Annotated[self.hint, *more])
-
-    def _read(self, value: Any, inner: pydantic.ValidatorFunctionWrapHandler) -> Any:
+    def read(value: Any, inner: pydantic.ValidatorFunctionWrapHandler) -> Any:
         try:
             return inner(value)
         except pydantic.ValidationError:
-            raise ValueError(f"expected {self.words}, got {_shown(value)}") from None
+            raise ValueError(f"expected {words}, got {_shown(value)}") from None
+
+    return pydantic.WrapValidator(read)
 
 
 def _rectangular(value: Any) -> Any:
@@ -134,25 +116,25 @@ def in_folder(name: str, info: pydantic.ValidationInfo) -> str:
 
 
 _TWO, _THREE = (pydantic.Field(min_length=size, max_length=size) for size in (2, 3))
-FILE = Expected("the name of a file", str, in_folder)
-INTERVAL = Expected(
-    "a lowest and a highest value, each a number or a list of numbers",
-    Annotated[list[float | list[float]], _TWO],
-    tuple,
-)
+_TUPLE = pydantic.AfterValidator(tuple)
+Positive = Annotated[float, pydantic.Field(gt=0.0)]
+FileName = Annotated[str, pydantic.AfterValidator(in_folder), expected("the name of a file")]
+INTERVAL = "a lowest and a highest value, each a number or a list of numbers"
+Interval = Annotated[list[float | list[float]], _TWO, expected(INTERVAL)]
+MATRIX = "a number, a list of numbers, or a matrix as a list of rows of one length"
 VALUES: dict[Any, Any] = {
     Callable[..., SX] | str: str,
-    str | Path: FILE,
-    str | Sequence[str]: Expected("a name or a list of names", str | list[str]),
-    Compiled: Expected("true, false or auto", bool | Literal["auto"]),
-    float | list[float]: Expected("a number or a list of numbers", float | list[float]),
-    ArrayLike: Expected(
-        "a number, a list of numbers, or a matrix as a list of rows of one length",
+    str | Path: FileName,
+    str | Sequence[str]: Annotated[str | list[str], expected("a name or a list of names")],
+    Compiled: Annotated[bool | Literal["auto"], expected("true, false or auto")],
+    float | list[float]: Annotated[float | list[float], expected("a number or a list of numbers")],
+    ArrayLike: Annotated[
         float | list[float] | list[list[float]],
-        _rectangular,
-    ),
-    Vector: Expected("3 numbers", Annotated[list[float], _THREE], tuple),
-    Pair: Expected("2 numbers", Annotated[list[float], _TWO], tuple),
+        pydantic.AfterValidator(_rectangular),
+        expected(MATRIX),
+    ],
+    Vector: Annotated[list[float], _THREE, _TUPLE, expected("3 numbers")],
+    Pair: Annotated[list[float], _TWO, _TUPLE, expected("2 numbers")],
 }
 """What stands in data for the types of values in annotations."""
 
@@ -167,16 +149,13 @@ def _shown(data: Any) -> str:
 
 _WORDS = {
     "float_type": "a number",
-    "finite_number": "a finite number",
     "greater_than": "a positive number",
     "greater_than_equal": "0 or more",
-    "int_type": "a whole number",
     "bool_type": "true or false",
     "string_type": "text",
-    "list_type": "a list",
     "dict_type": "names with values",
 }
-"""What is expected, by pydantic's name of the problem."""
+"""What is expected, by pydantic's name of the problem, where its own words are a programmer's."""
 
 
 def _told(error: ErrorDetails, tag: str, names: Sequence[str], no_tag: str) -> InitErrorDetails:
@@ -219,7 +198,7 @@ class Reader:
     def __init__(
         self, form: type, families: Mapping[Any, Family], keys: Mapping[type, Mapping[str, Key]]
     ) -> None:
-        self._families, self._keys = families, keys
+        self._keys, self._data_for = keys, {**VALUES, **families}
         self._types, self._free = dict[Any, Any](), set[str]()  # Keys whose names are free.
         self._tags = {c: t for f in families.values() for t, c in f.members.items()}
         self.tags = list(dict.fromkeys(self._tags.values()))
@@ -293,22 +272,15 @@ class Reader:
 
     def _type(self, hint: Any) -> Any:
         """The pydantic type of data for an annotation."""
-        origin, parts, members = get_origin(hint), get_args(hint), _members(hint)
+        origin, parts, members = typing.get_origin(hint), typing.get_args(hint), _members(hint)
         if origin is Annotated:
             return Annotated[self._type(parts[0]), *parts[1:]]
-        value = next((v for base, v in VALUES.items() if _members(base) <= members), None)
-        value = Annotated[Any, value] if isinstance(value, Expected) else value
-        family = next((f for base, f in self._families.items() if base in members), None)
-        if value is None and family is not None:
-            if id(family) not in self._types:
-                self._types[id(family)] = self._choice(family)
-            value = self._types[id(family)]
-        if value is not None:
-            return value | None if NoneType in members else value
+        for base, data in self._data_for.items():
+            if _members(base) <= members:
+                found = self._once(data, self._choice) if isinstance(data, Family) else data
+                return found | None if NoneType in members else found
         if self._is_form(hint):
-            if hint not in self._types:
-                self._types[hint] = self._data(hint)
-            return self._types[hint]
+            return self._once(hint, self._form)
         if origin in (Union, UnionType):
             return Union[tuple(map(self._type, parts))]  # noqa: UP007
         if origin in (list, Sequence):
@@ -317,11 +289,16 @@ class Reader:
             return dict[str, self._type(parts[1])]  # type: ignore[misc]
         return hint
 
-    def _data(self, form: type, family: Family | None = None) -> Any:
+    def _once(self, key: Any, make: Callable[[Any], Any]) -> Any:
+        if key not in self._types:
+            self._types[key] = make(key)
+        return self._types[key]
+
+    def _form(self, form: type, family: Family | None = None) -> Any:
         """The type of the data of a form."""
         entries, keys = dict[str, Any](), self._keys_of(form)
         for name, key in keys.items():
-            if any(get_origin(one) in (dict, Mapping) for one in _members(key.hint)):
+            if any(typing.get_origin(one) in (dict, Mapping) for one in _members(key.hint)):
                 self._free.add(name)
             more = {} if key.default is MISSING else {"default": self.write(key.default)}
             about = pydantic.Field(description=key.text or None, json_schema_extra=more)
@@ -329,15 +306,18 @@ class Reader:
             entries[name] = entry if key.default is MISSING else NotRequired[entry]
         make_type: Any = TypedDict
         data = make_type(self._tags.get(form, form.__name__), entries)
-        data.__doc__ = introduction(form.__doc__ or "")
+        data.__doc__ = re.split(r"^\w+:$", inspect.cleandoc(form.__doc__ or ""), flags=re.M)[
+            0
+        ].strip()
         data.__pydantic_config__ = pydantic.ConfigDict(
             extra="forbid", strict=True, allow_inf_nan=False
         )
-        own = {
-            n: k.default for n, k in self._keys.get(form, {}).items() if k.default is not MISSING
-        }
-        tag = "" if family is None else f"{self._tags[form]} "
-        tags = "" if family is None else f". No tag is given; there are {', '.join(family.members)}"
+        own = {n: k.default for n, k in self._keys.get(form, {}).items()}
+        own = {name: default for name, default in own.items() if default is not MISSING}
+        tag, tags = "", ""
+        if family is not None:
+            tag = f"{self._tags[form]} "
+            tags = f". No tag is given; there are {', '.join(family.members)}"
 
         def read(given: Any, inner: pydantic.ValidatorFunctionWrapHandler) -> Any:
             is_tagged = isinstance(given, dict) and TAG in given
@@ -357,24 +337,32 @@ class Reader:
     def _choice(self, family: Family) -> Any:
         """The type of the data of a family."""
         members = [
-            Annotated[self._data(form, family), pydantic.Tag(tag)]
+            Annotated[self._form(form, family), pydantic.Tag(tag)]
             for tag, form in family.members.items()
         ]
+        words = f"one of {', '.join(family.members)}"
         if family.plain is not None:
             members.append(Annotated[family.plain, pydantic.Tag("!")])
-        choose = pydantic.Discriminator(family.tag_of), pydantic.BeforeValidator(family.check)
-        return Annotated[Union[tuple(members)], *choose]  # noqa: UP007
+            words = f"{'text' if family.plain is str else 'a number'}, or {words}"
+        choose = pydantic.Discriminator(family.tag_of, "tag", words)
+        return Annotated[Union[tuple(members)], choose]  # noqa: UP007
 
 
 def _members(hint: Any) -> set[Any]:
     """The members of a Union; any other annotation is its own only member."""
-    return set(get_args(hint)) if get_origin(hint) in (Union, UnionType) else {hint}
+    return set(typing.get_args(hint)) if typing.get_origin(hint) in (Union, UnionType) else {hint}
 
 
 @cache
 def keys_of(form: type) -> Mapping[str, Key]:
     """The keys of a dataclass: the fields that its constructor takes."""
-    hints, texts = get_type_hints(form, include_extras=True), _attribute_texts(form)
+    hints, texts = typing.get_type_hints(form, include_extras=True), dict[str, str]()
+    for cls in reversed(form.__mro__):  # Their texts are in docstrings, also of bases.
+        _, _, rest = inspect.cleandoc(cls.__doc__ or "").partition("\nAttributes:\n")
+        section = re.split(r"^\S", rest, maxsplit=1, flags=re.MULTILINE)[0]
+        for entry in re.split(r"^    (?=\w)", section, flags=re.MULTILINE)[1:]:
+            names, _, text = entry.partition(":")
+            texts |= dict.fromkeys(names.split(", "), " ".join(text.split()))
     return {
         item.name: Key(
             hints[item.name],
@@ -386,19 +374,128 @@ def keys_of(form: type) -> Mapping[str, Key]:
     }
 
 
-def introduction(docstring: str) -> str:
-    """A docstring up to its first section, such as "Attributes:"."""
-    text = inspect.cleandoc(docstring)
-    return re.split(r"^\w+:$", text, maxsplit=1, flags=re.MULTILINE)[0].strip()
+_REPLACED = ("int", "float", "timestamp")
 
 
-def _attribute_texts(source: type) -> dict[str, str]:
-    """Name of an attribute -> its text in the docstring of the class or of one of its bases."""
-    found: dict[str, str] = {}
-    for cls in reversed(source.__mro__):
-        _, _, rest = inspect.cleandoc(cls.__doc__ or "").partition("\nAttributes:\n")
-        section = re.split(r"^\S", rest, maxsplit=1, flags=re.MULTILINE)[0]
-        for entry in re.split(r"^    (?=\w)", section, flags=re.MULTILINE)[1:]:
-            names, _, text = entry.partition(":")
-            found |= dict.fromkeys(names.split(", "), " ".join(text.split()))
-    return found
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 with numbers as in JSON, and tags."""
+
+    yaml_implicit_resolvers: ClassVar = {  # Without the types whose forms are replaced below.
+        first: [pair for pair in pairs if pair[0].rpartition(":")[2] not in _REPLACED]
+        for first, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_tagged(self, tag: str, node: yaml.Node) -> dict[str, Any]:
+        if not isinstance(node, yaml.MappingNode):
+            raise _error(f"the tag !{tag} must be followed by keys, or by {{}}", node)
+        return {TAG: f"!{tag}", **self.construct_mapping(node, deep=True)}
+
+
+class _Dumper(yaml.SafeDumper):
+    """Keeps the order of keys, and writes tags."""
+
+    def represent_tagged(self, data: dict[str, Any]) -> yaml.MappingNode:
+        entries = [(key, value) for key, value in data.items() if key != TAG]
+        return self.represent_mapping(data.get(TAG, "tag:yaml.org,2002:map"), entries)
+
+
+_Loader.add_multi_constructor("!", _Loader.construct_tagged)
+_Dumper.add_representer(dict, _Dumper.represent_tagged)
+# YAML 1.1 also has 1_000, 010 for eight and 1:30 for ninety. Here these are text, and 1e5 a number.
+_NUMBERS = {
+    "int": r"[-+]?(0|[1-9][0-9]*)$",
+    "float": r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
+    r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$",
+}
+for _kind, _form in _NUMBERS.items():
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_kind}", re.compile(_form), list("-+.0123456789")
+        )
+
+
+def _error(problem: str, node: yaml.Node) -> yaml.MarkedYAMLError:
+    return yaml.constructor.ConstructorError(problem=problem, problem_mark=node.start_mark)
+
+
+def _count(node: yaml.Node, counts: dict[int, int]) -> int:
+    """The number of values of a node, whose keys and texts are checked."""
+    if id(node) in counts:
+        return counts[id(node)]
+    counts[id(node)] = MOST_VALUES  # For an alias inside itself.
+    parts, names = node.value, set[str]()
+    if isinstance(node, yaml.ScalarNode):
+        parts = []
+        if not can_be_written(node.value):
+            text = "the text has half of a letter (\\ud800 to \\udfff), which no file can hold"
+            raise _error(text, node)
+    elif isinstance(node, yaml.MappingNode):
+        for key, _ in node.value:
+            if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
+                name = brief(key.value) if isinstance(key, yaml.ScalarNode) else "of a mapping"
+                raise _error(f"the key {name} is not text; quote it", key)
+            if key.value in names:
+                raise _error(f"the key '{key.value}' is given twice", key)
+            names.add(key.value)
+        parts = [part for pair in node.value for part in pair]
+    count = counts[id(node)] = 1 + sum(_count(part, counts) for part in parts)
+    if count > MOST_VALUES:
+        text = f"more than {MOST_VALUES} values, counting aliases as often as they are used"
+        raise _error(text, node)
+    return count
+
+
+def load_yaml(text: str, name: str) -> Any:
+    """YAML as lists, dictionaries and plain values; a tag becomes the entry "_tag"."""
+    return load_lines(text, name)[0]
+
+
+def load_lines(text: str, name: str) -> tuple[Any, Callable[[str], int | None]]:
+    """What `load_yaml` returns, and the line of a dotted key; None if the text does not have it."""
+    if len(text) > MOST_TEXT:
+        raise ScenarioError((name, f"more than {MOST_TEXT} characters, got {len(text)}"))
+    data, lines = None, dict[str, int]()
+    try:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        if node is not None:
+            _count(node, {})
+            data, lines = loader.construct_document(node), dict(_lines(node, node, ""))
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        problem = ", ".join(part for part in (error.context, error.problem) if part)
+        if "<document start>" in problem:
+            problem = "more than one value; several stand in brackets, as in [[-4], [-8]]"
+        raise ScenarioError((name, line + problem)) from None
+    except yaml.YAMLError as error:  # Control characters.
+        raise ScenarioError((name, str(error))) from None
+    except RecursionError:
+        raise ScenarioError((name, "too many lists or keys in each other")) from None
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+        # Of PyYAML, where a tag such as !!int or !!timestamp has a value that is none.
+        raise ScenarioError((name, "a tag of YAML (!!...) does not fit its value")) from None
+    return data, lines.get
+
+
+def _lines(place: yaml.Node, node: yaml.Node, key: str) -> Iterator[tuple[str, int]]:
+    """The dotted keys of a node at its place in the text, and the line of each."""
+    yield key, place.start_mark.line + 1
+    parts = []
+    if isinstance(node, yaml.SequenceNode):
+        parts = [(str(index), part, part) for index, part in enumerate(node.value)]
+    elif isinstance(node, yaml.MappingNode):
+        parts = [(name.value, name, part) for name, part in node.value]
+    for name, start, part in parts:
+        yield from _lines(start, part, f"{key}.{name}" if key else name)
+
+
+def first_name(names: Iterable[str], key: str) -> str | None:
+    """The longest of some names with which a dotted key begins; None if it begins with none."""
+    found = [name for name in names if f"{key}.".startswith(f"{name}.")]
+    return max(found, key=len, default=None)
+
+
+def dump_yaml(data: Any) -> str:
+    """The text of plain data, which `load_yaml` reads back equal."""
+    options = {"allow_unicode": True, "default_flow_style": None, "width": 100}
+    return str(yaml.dump(data, Dumper=_Dumper, **options))

@@ -1,19 +1,18 @@
-"""The gains that a scenario with compliant contact leaves out, and what belongs to them."""
+"""The gains and the estimator that a scenario with contact that gives way leaves out."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from drake_dae.dae import AdvisedGains, ContactGains, Structure, advised_gains, contact_gains
-from drake_dae.dae.beyond.advised_gains import settles_along
+from drake_dae.dae import AdvisedGains, Structure, advised_gains, contact_gains
+from drake_dae.dae.advised_gains import settles_along
 from drake_dae.errors import GainError, ScenarioError
-from drake_dae.robots import RobotModel
+from drake_dae.robots import JointFriction, Plane, PointOnSurface, RobotModel, velocities_are_rates
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.estimated import estimates_all
 from drake_dae.scenario.expected import (
     PATCH_FORCE,
-    Touch,
     expected,
     jam,
     least_damping,
@@ -22,50 +21,44 @@ from drake_dae.scenario.expected import (
     sensed_contact,
     stated_errors,
     timing,
+    with_lasting_touches,
 )
 from drake_dae.scenario.form import at
 from drake_dae.scenario.model import references_of
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.robot_file.robot import Payload
+from drake_dae.scenario.scenario import Scenario, WrittenConstraint
 from drake_dae.scenario.start import opening_contact
 
-_SOFTER = 5.0
-"""The ratio of the poles of positions to those of the distance, of a robot without contact."""
-
-NOISE = 1e-3
-"""The standard deviation of velocity noise in rad/s, without encoders."""
-
-_SHARE = 0.003
-"""The default of the largest roughness, as a fraction of the largest effort limit."""
+_SOFTER = 5.0  # The ratio of the poles of positions to those of the distance, without contact.
+NOISE = 1e-3  # The standard deviation of velocity noise in rad/s, without encoders.
+_SHARE = 0.003  # The default of the largest roughness, as a fraction of the largest effort limit.
+LEAST_MASS = 1e-6  # The mass in kg of a load that nobody has stated; masses are positive.
+_EFFORT = 100.0  # The largest effort in N m of drives without limits in the file.
+# The largest load relative to the robot's mass, and its largest distance from its frame in m; the
+# largest tilt in rad and displacement in m of a plane; and the largest friction of a joint in N m,
+# and in N m per rad/s, relative to its largest effort.
+_LOAD, _CENTER, _TILT, _PLACE, _COULOMB, _VISCOUS = 0.2, 0.2, 0.15, 0.01, 0.1, 0.25
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
-    """The gains and other settings that a scenario on contact that gives way leaves out.
-
-    These are gains, integrals of forces and of points, constraint damping, an estimator, and
-    measured force, each if it is left out; and for a task the gains without contact, soft along the
-    distance. With encoders and rigid joints the gains are those of `advised_gains`; otherwise those
-    of `contact_gains`. A scenario with `law.gains`, or with ideal contact, is unchanged.
-
-    Raises:
-        ScenarioError: There are no default gains for such a scenario, or none are smooth and stable
-            enough; or `largest_roughness` or `largest_errors` is given and not used.
-    """
-    material = scenario.plant.material
-    law, sensors = scenario.law, scenario.sensors
-    _check_bounds(scenario)
+    """The scenario with gains of `advised_gains` or `contact_gains`, and what belongs to them."""
+    material, law, sensors = scenario.plant.material, scenario.law, scenario.sensors
+    for name in ("largest_roughness", "largest_errors"):
+        is_used = scenario.is_advised and sensors.encoders is not None
+        if getattr(law, name) is not None and not is_used:
+            text = (
+                "it is used only if `law.gains` is left out, `sensors.encoders` is given, and the "
+                "plant is !CompliantContact or !MultibodyPlant; leave it out, or change these"
+            )
+            raise ScenarioError((f"law.{name}", text))
     if material is None or not scenario.is_advised:
         return Completed(scenario)
-    if model.stages:
-        text = (
-            "no gains are computed if the robot has springs, motors or valves. Give gains, "
-            "integral and estimator, as in the scenario wall_flexible_contact"
-        )
-        raise ScenarioError(("law.gains", text))
     period, late = timing(scenario)
-    if not period:
+    if model.stages or not period:
         text = (
-            "for a continuous compliant plant without `sampling` no gains are computed; give some, "
-            "or a sampling"
+            "no gains are computed if the robot has springs, motors or valves, nor for a "
+            "continuous compliant plant without `sampling`. Give gains, integral and estimator, as "
+            "in the scenario wall_flexible_contact"
         )
         raise ScenarioError(("law.gains", text))
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
@@ -77,62 +70,53 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         with at("law.gains"):
             best, outlook = _sensed_gains(scenario, model, structure, stiffness)
         contact, fast, known_by = best.gains, best.state_rate, "these encoders"
+
+    # The law. A force of degree 0 has a gain only if it is integrated.
     names = [signal.name for signal in model.dae.output_signals]
-    positions, forces = np.split(np.array(names), [len(model.position_signals)])
-    points = moved_points(model)
-    integral = law.integral
+    positions, forces = names[: len(model.position_signals)], names[len(model.position_signals) :]
+    integral, points = law.integral, moved_points(model)
     if integral is None:
-        integral = [name for name in positions if name in points] + forces.tolist()
-    force = sensors.force or parts.MeasuredForce(sample_period=period)
-    # A force of degree 0 has a gain only if it is integrated.
-    of_forces = {
-        name: [rounded(contact.force_gain)] for name in forces.tolist() if name in integral
-    }
-    of_positions = {
-        name: [rounded(gain) for gain in contact.position_gains(3 if name in integral else 2)]
-        for name in positions.tolist()
-    }
-    gains = parts.Coefficients(outputs=of_positions | of_forces)
+        integral = [name for name in positions if name in points] + forces
+    of_outputs = {n: contact.position_gains(3 if n in integral else 2) for n in positions}
+    of_outputs |= {name: [contact.force_gain] for name in forces if name in integral}
     damping = law.constraint_damping
     if damping is None and contact.constraint_damping:
         damping = parts.Poles(all=[-rounded(contact.constraint_damping)])
+
+    # The estimator.
     estimator = scenario.estimator or parts.Estimator()
     frictional = [c.friction_parameter for c in model.constraints if c.friction_parameter]
     if estimator.rate is None:
+        named = estimator.parameters
         estimator = replace(
             estimator,
             rate=rounded(contact.observer_rate),
             force_rate=rounded(contact.observer_force_rate),
             friction_rate=rounded(contact.friction_rate),
-            parameters=None
-            if estimator.parameters is None
-            else list(dict.fromkeys([*frictional, *estimator.parameters])),
+            parameters=None if named is None else list(dict.fromkeys([*frictional, *named])),
             state_rate=None if fast is None else rounded(fast),
         )
-    if not estimates_all(replace(scenario, estimator=estimator), model):
-        named = frictional if estimator.parameters is None else estimator.parameters
-        estimator = replace(estimator, parameters=named)
-    task = scenario.task
-    if task is not None and task.gains is None:
-        task = replace(task, gains=_free_gains(scenario, model, contact))
-    touch_note = ""
+    given = replace(scenario, estimator=estimator)
+    if estimator.parameters is None and not estimates_all(given, model):
+        estimator = replace(estimator, parameters=frictional)
+
+    # The task: soft along the distance while the contact is open, see `TaskController`.
+    task, touch_note = scenario.task, ""
     if task is not None:
-        touching = Touch(
-            stiffness,
-            mobility,
-            contact.constraint_damping if damping is None else least_damping(structure, damping),
-            contact.force_gain,
-            period,
-            late=period * (1 + late),
-        )
-        task = touching.slowed(task)
-        touch_note = touching.note(task)
+        if task.gains is None:
+            free = {signal.name: contact.position_gains(2) for signal in model.position_signals}
+            rate = contact.position_rate / _SOFTER
+            for point in opening_contact(scenario, model):
+                free[point.residual_signals[0].name] = [rate**2, 2.0 * rate]
+            task = replace(task, gains=_coefficients(free))
+        acting = least_damping(structure, damping), contact.force_gain, period, period * (1 + late)
+        task, touch_note = with_lasting_touches(task, stiffness, mobility, *acting)
     chosen = replace(
         scenario,
         task=task,
         law=replace(
             law,
-            gains=gains,
+            gains=_coefficients(of_outputs),
             integral=integral,
             constraint_damping=damping,
             contact_stiffness=_fed_ahead(scenario, structure, stiffness),
@@ -140,12 +124,13 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             largest_errors=None,
         ),
         estimator=estimator,
-        sensors=replace(sensors, force=force),
+        sensors=replace(sensors, force=sensors.force or parts.MeasuredForce(sample_period=period)),
     )
-    stated = stated_errors(chosen, model, structure)
-    named = estimator.parameters or []
-    identified = ", ".join(name for name in named if name in frictional) or "none"
-    if estimator.parameters is None:
+
+    # What it is, in words.
+    stated, named = stated_errors(chosen, model, structure), estimator.parameters
+    identified = ", ".join(name for name in named or () if name in frictional) or "none"
+    if named is None:
         identified = "friction, loads, tilts and places of planes"
         if scenario.compliances is not None:
             identified = "friction and loads"
@@ -161,6 +146,10 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     )
     told = note, jam(scenario, model, structure, material.friction)
     return Completed(chosen, tuple(filter(None, told)))
+
+
+def _coefficients(gains: Mapping[str, Sequence[float]]) -> parts.Coefficients:
+    return parts.Coefficients(outputs={n: [*map(rounded, own)] for n, own in gains.items()})
 
 
 def _sensed_gains(
@@ -193,45 +182,77 @@ def _sensed_gains(
 
 
 def _fed_ahead(scenario: Scenario, structure: Structure, stiffness: float) -> float | None:
-    """The stiffness by which the deflection of contacts is fed ahead, if the references allow it.
-
-    All constraint forces are outputs then, with references that have two derivatives.
-    """
+    """The stiffness by which the deflection of contacts is fed ahead, if references allow it."""
     system, given = structure.system, scenario.law.contact_stiffness
     if given is not None or scenario.task is not None:
         return given
-    names, degrees = [s.name for s in system.output_signals], list(structure.output_degrees)
-    forces = [s.name for s in system.constraint_input_signals]
-    of_forces = [i for i, name in enumerate(names) if name in forces]
-    is_fit = len(of_forces) == len(forces) and {*structure.constraint_degrees} == {2}
-    if not is_fit or any(degrees[i] for i in of_forces):
+    # All constraint forces are outputs then, with references that have two derivatives.
+    names = [signal.name for signal in system.output_signals]
+    forces = [signal.name for signal in system.constraint_input_signals]
+    degrees = dict(zip(names, structure.output_degrees, strict=True))
+    if {*structure.constraint_degrees} != {2} or any(degrees.get(name, 1) for name in forces):
         return None
-    degrees = [2 if i in of_forces else degree for i, degree in enumerate(degrees)]
     try:
-        references_of(scenario, names, degrees)
+        references_of(scenario, names, [*(degrees | dict.fromkeys(forces, 2)).values()])
     except ScenarioError:
         return None
     return rounded(stiffness)
 
 
-def _check_bounds(scenario: Scenario) -> None:
-    """Refuses bounds for computed gains where none are computed by them."""
-    is_used, law = scenario.is_advised and scenario.sensors.encoders is not None, scenario.law
-    for name in ("largest_roughness", "largest_errors"):
-        if getattr(law, name) is not None and not is_used:
-            text = (
-                "it is used only if `law.gains` is left out, `sensors.encoders` is given, and the "
-                "plant is !CompliantContact or !MultibodyPlant; leave it out, or change these"
-            )
-            raise ScenarioError((f"law.{name}", text))
+def estimates_all(scenario: Scenario, model: RobotModel) -> bool:
+    """Whether an estimator of rigid joints may estimate what it can."""
+    estimator, material = scenario.estimator, scenario.plant.material
+    if estimator is None or estimator.parameters is not None or material is None:
+        return False
+    surfaces = [c.surface for c in scenario.constraints if isinstance(c, PointOnSurface)]
+    is_plain = all(isinstance(surface, Plane) for surface in surfaces)  # On a sphere it got worse.
+    is_rigid = not model.stages and velocities_are_rates(model.links)
+    return is_plain and is_rigid and not scenario.exogenous
 
 
-def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) -> parts.Coefficients:
-    """The gains of a task without contact, soft along the distance: see `TaskController`."""
-    rate = contact.position_rate / _SOFTER
-    gains = {signal.name: contact.position_gains(2) for signal in model.position_signals}
-    for point in opening_contact(scenario, model):
-        gains[point.residual_signals[0].name] = [rate**2, 2.0 * rate]
-    return parts.Coefficients(
-        outputs={name: [rounded(gain) for gain in values] for name, values in gains.items()}
+def with_friction_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
+    """The scenario of a law whose estimator knows the friction of contacts that have it."""
+    assert scenario.estimator is not None
+    names = [c.friction_parameter for c in model.constraints if c.friction_parameter]
+    return replace(scenario, estimator=replace(scenario.estimator, parameters=names))
+
+
+def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
+    """The scenario of a law whose estimator knows a load at each contact, planes and friction."""
+    assert scenario.estimator is not None
+    robot, frictional, constraints = scenario.robot, list[str](), list[WrittenConstraint]()
+    ranges, loads = dict[str, float](), dict[str, Payload]()
+    known = {p.name for p in model.dae.parameters}
+    masses = [p.value[0] for p in model.dae.parameters if p.name.endswith(".mass")]
+    for constraint in scenario.constraints:
+        if isinstance(constraint, PointOnSurface):
+            constraint = replace(constraint, friction=constraint.friction or 0.0)
+            frictional.append(f"{constraint.name}.friction")
+            if scenario.compliances is None:  # Surfaces of redundant constraints are not estimated.
+                constraint = replace(constraint, rpy=constraint.rpy or (0.0, 0.0, 0.0))
+                ranges[f"{constraint.name}.rpy"] = _TILT
+                ranges[f"{constraint.name}.position"] = _PLACE
+            if constraint.frame not in loads:
+                name = constraint.frame.replace("::", "_") + "_load"
+                loads[constraint.frame] = Payload(constraint.frame, LEAST_MASS, name=name)
+                ranges[f"{name}.mass"] = _LOAD * sum(masses)
+                ranges[f"{name}.center"] = _CENTER
+        constraints.append(constraint)
+    # An effort that the file does not limit is taken for the largest one that it does.
+    names = [signal.name for signal in model.links.position_signals]
+    efforts = np.where(np.isfinite(model.control_limits), model.control_limits, 0.0)
+    largest = float(np.max(efforts, initial=0.0)) or _EFFORT
+    efforts = np.where(efforts > 0.0, efforts, largest)
+    if efforts.size != len(names):
+        efforts = np.full(len(names), largest)
+    for joint, effort in zip(names, efforts.tolist(), strict=True):
+        ranges[f"{joint}.coulomb"] = _COULOMB * effort
+        ranges[f"{joint}.viscous"] = _VISCOUS * effort
+    joints = [joint for joint in names if f"{joint}.coulomb" not in known]
+    forces = [*robot.known_forces, *([JointFriction(joints)] if joints else [])]
+    return replace(
+        scenario,
+        robot=replace(robot, payloads=[*robot.payloads, *loads.values()], known_forces=forces),
+        constraints=constraints,
+        estimator=replace(scenario.estimator, parameters=[*frictional, *ranges], ranges=ranges),
     )

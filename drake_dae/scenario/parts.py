@@ -1,110 +1,182 @@
-"""Parts of a scenario without a class in the library, or written otherwise than that has it."""
+"""What stands below the keys of a scenario where no class of the library says it."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, TypeVar, cast
+from dataclasses import dataclass, field, fields
+from importlib import import_module
+from typing import Annotated, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant as DrakePlant
+from pydrake.systems.framework import Context
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae import GainDesign, gain_coefficients, gain_matrices, poles
-from drake_dae.errors import GainError, ModelError
+from drake_dae.dae import ConstraintStructure, GainDesign, gain_coefficients, gain_matrices, poles
+from drake_dae.errors import DrakeDaeError, GainError, ModelError
 from drake_dae.references import Reference
-from drake_dae.robots import (
-    Constraint,
-    FrictionCone,
-    PositionOutput,
-    SurfaceCoordinates,
-    TiltFromNormal,
-    WeldedFrames,
-)
-from drake_dae.scenario.robot_file.robot import Pose
-from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.sensing.encoders import Encoders
-from drake_dae.systems.task.phases import Phase
-from drake_dae.systems.task.task import Task
+from drake_dae.robots import FrictionCone, RobotModel
+from drake_dae.scenario.form import Positive, at, expected
+from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Payload, Robot
+from drake_dae.systems.break_away import Observing
+from drake_dae.systems.compliant_plant import CompliantPlant
+from drake_dae.systems.contact_forces import DisturbanceForce
+from drake_dae.systems.contact_material import ContactMaterial, PointMaterial
+from drake_dae.systems.contact_plant import ContactPlant
+from drake_dae.systems.ideal_plants import RobotPlant
+from drake_dae.systems.phases import Phase
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.sensors import Encoders
+from drake_dae.systems.task import Task
 
-T = TypeVar("T", Constraint, PositionOutput)
-Positive = Annotated[float, Field(gt=0.0)]
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioPlant(ABC):
+    """What a scenario simulates.
+
+    Attributes:
+        parameters: Parameter name -> the plant's value, unknown to the law's model; one number for
+            all entries, or a list. A surface can be tilted if it has the key `rpy`.
+        payloads: Additional masses on the plant, unknown to the law's model.
+        disturbances: Disturbance forces on the plant, unknown to the law.
+    """
+
+    parameters: dict[str, float | list[float]] = field(default_factory=dict)
+    payloads: list[Payload] = field(default_factory=list)
+    disturbances: list[DisturbanceForce] = field(default_factory=list)
+
+    carries: ClassVar[bool] = False
+    """Whether the plant has these itself. Else a model has the payloads and disturbances, and
+    numbers are set in a context, or, if it does not adjust, the plant is made anew for each."""
+    adjusts: ClassVar[bool] = True
+    in_context: ClassVar[frozenset[str]] = frozenset()
+    """The keys of numbers that `begin` sets in a context."""
+
+    @property
+    def material(self) -> PointMaterial | None:
+        """The material of contacts that give way."""
+        return None
+
+    @property
+    def rolled(self) -> "ScenarioPlant":
+        """What a rollout runs: this, or what has a traced plant."""
+        return self
+
+    def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
+        """Sets the numbers of `in_context` in a context of the plant."""
+
+    @abstractmethod
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        """The plant of a robot, with the structure of its system."""
 
 
 @dataclass(frozen=True)
-class WeldedFramesForm:
-    """Frame B has a fixed pose in frame A, given by angles.
+class IdealConstraints(ScenarioPlant):
+    """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
 
-    Attributes:
-        frame_a: Name of frame A; it may be "world".
-        frame_b: Name of frame B, on another body.
-        pose: The pose of B in A; by default the frames coincide.
-        name: The name of the constraint, the prefix of its forces and its parameter.
-    """
-
-    frame_a: str
-    frame_b: str
-    pose: Pose = field(default_factory=Pose)
-    name: str = "weld"
-
-    def make(self, constraints: Sequence[Constraint]) -> Constraint:
-        """The constraint."""
-        rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
-        pose = RigidTransform(rotation, self.pose.translation)
-        return WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        return RobotPlant(model, structure=structure)
 
 
 @dataclass(frozen=True)
-class SurfaceCoordinatesForm:
-    """The coordinates along a constraint.
+class MultibodyPlant(ContactMaterial, ScenarioPlant):
+    """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
-    Attributes:
-        constraint: The name of a constraint with coordinates, such as a PointOnSurface on a !Plane.
+    A ball at the tool touches the surfaces of the constraints. With point contact the force is
+    stiffness times depth. With hydroelastic contact the ball is rigid, and the pressure of the
+    surface is modulus times depth / thickness. Where the tool tilts, the ball rolls, the farther
+    off ideal contact the larger its radius.
     """
 
-    constraint: str
+    carries: ClassVar[bool] = True
 
-    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
-        """The output."""
-        return SurfaceCoordinates(_named(self.constraint, constraints))
+    @property
+    def material(self) -> ContactMaterial:
+        return self
+
+    @property
+    def rolled(self) -> ScenarioPlant:
+        if self.contact_model != "point":
+            return self
+        names = [f.name for f in (*fields(PointMaterial), *fields(ScenarioPlant))]
+        return CompliantContact(**{name: getattr(self, name) for name in names})
+
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        def add(plant: DrakePlant, scene_graph: SceneGraph) -> None:
+            read_robot(robot, plant, scene_graph, self.payloads)
+
+        with at("plant or plant.parameters"):
+            return ContactPlant(
+                model,
+                add,
+                self,
+                structure=structure,
+                parameters=self.parameters,
+                disturbances=self.disturbances,
+            )
 
 
 @dataclass(frozen=True)
-class TiltFromNormalForm:
-    """The tilt of a tool's axis from the surface normal at its contact.
+class CompliantContact(PointMaterial, ScenarioPlant):
+    """The plant is a `CompliantPlant`: Drake's point contact as equations of this library.
 
-    Attributes:
-        constraint: The name of a constraint with a free side, such as a PointOnSurface.
-        axis: The axis of its frame, "x", "y" or "z".
-        components: The rows, a choice of the two other axes, "xy" for example; both if empty.
+    It contains no MultibodyPlant, so rollouts are hundreds of times as fast as Drake's plant. It
+    supports what `!MultibodyPlant` does not: surfaces of any shape, moving surfaces, exogenous
+    signals, exports. It has no stops at the limits of joints. With a time_step of 0 it is
+    continuous.
     """
 
-    constraint: str
-    axis: str
-    components: str = ""
+    in_context: ClassVar = frozenset({"stiffness", "dissipation", "friction", "radius"})
 
-    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
-        """The output."""
-        return TiltFromNormal(_named(self.constraint, constraints), self.axis, self.components)
+    @property
+    def material(self) -> PointMaterial:
+        return self
 
+    def begin(self, plant: Plant, context: Context) -> None:
+        cast(CompliantPlant, plant).set_contact(context, self)
 
-WrittenConstraint = Constraint | WeldedFramesForm
-WrittenOutput = PositionOutput | SurfaceCoordinatesForm | TiltFromNormalForm
-
-
-def make(
-    form: T | WeldedFramesForm | SurfaceCoordinatesForm | TiltFromNormalForm,
-    constraints: Sequence[Constraint],
-) -> T:
-    """The library's object of a form that may name constraints; such an object as it is."""
-    return cast(T, form.make(constraints) if hasattr(form, "make") else form)
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        with at("plant or plant.parameters"):  # Whose numbers are set in a context.
+            return CompliantPlant(model, self, structure=structure)
 
 
-def _named(name: str, constraints: Sequence[Constraint]) -> Constraint:
-    named = {constraint.name: constraint for constraint in constraints}
-    if name not in named:
-        raise ModelError(unknown_name("constraint", name, named))
-    return named[name]
+@dataclass(frozen=True)
+class OwnPlant(ScenarioPlant):
+    """The plant is your own class that follows the contract of `drake_dae.Plant`.
+
+    It is called with the robot and its structure, as `maker(model, structure)`. Running such a
+    scenario imports the module, found by PYTHONPATH, also in the processes of a sweep: use only
+    files from people whose code you trust.
+
+    Attributes:
+        maker: The module and the class in it, as "my_plants:SpringyPlant".
+    """
+
+    maker: Annotated[
+        str,
+        Field(pattern=r"^[^:]+:[^\W\d]\w*$"),
+        expected("a module and a class in it, as my_plants:SpringyPlant"),
+    ]
+    adjusts: ClassVar[bool] = False
+
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        module, _, name = self.maker.partition(":")
+        with at("plant.maker"):
+            try:
+                plant = getattr(import_module(module), name)(model, structure)
+            except DrakeDaeError:
+                raise
+            except Exception as error:
+                what = f"{type(error).__name__}: {error}"
+                raise ModelError(f"'{self.maker}' cannot be loaded and made: {what}") from error
+            if not isinstance(plant, Plant):
+                raise ModelError(
+                    f"'{self.maker}' makes no plant that keeps the contract of drake_dae.Plant"
+                )
+            return plant
 
 
 @dataclass(frozen=True)

@@ -10,32 +10,106 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, cast
 
-from pydantic import AfterValidator, Field
+import numpy as np
+from pydantic import AfterValidator
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae import references as rs
 from drake_dae import robots
 from drake_dae.arguments import checked
-from drake_dae.arrays import listed
-from drake_dae.errors import ScenarioError
+from drake_dae.arrays import listed, unknown_name
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.files import read_text
 from drake_dae.references import Reference
-from drake_dae.robots import ForceOutput, Load, Stage, Surface
+from drake_dae.robots import Constraint, ForceOutput, Load, PositionOutput, Stage, Surface
 from drake_dae.running.simulate import check_config
-from drake_dae.scenario import form, parts, plants, typed_yaml
-from drake_dae.scenario.form import Family, Key, Reader, keys_of
-from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario import form, parts
+from drake_dae.scenario.form import Family, Key, Positive, Reader, keys_of
+from drake_dae.scenario.robot_file.robot import Pose, Robot
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
-from drake_dae.systems.control.drives import Sampling
-from drake_dae.systems.task import phases as ps
+from drake_dae.systems import phases
+from drake_dae.systems.applied_control import Sampling
+from drake_dae.systems.phases import Phase
 from drake_dae.trace.compiled import Compiled
 
+T = TypeVar("T", Constraint, PositionOutput)
 
-def _valid(config: SimulatorConfig) -> SimulatorConfig:
-    check_config(config)
-    return config
+
+@dataclass(frozen=True)
+class WeldedFramesForm:
+    """Frame B has a fixed pose in frame A, given by angles.
+
+    Attributes:
+        frame_a: Name of frame A; it may be "world".
+        frame_b: Name of frame B, on another body.
+        pose: The pose of B in A; by default the frames coincide.
+        name: The name of the constraint, the prefix of its forces and its parameter.
+    """
+
+    frame_a: str
+    frame_b: str
+    pose: Pose = field(default_factory=Pose)
+    name: str = "weld"
+
+    def make(self, constraints: Sequence[Constraint]) -> Constraint:
+        rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
+        pose = RigidTransform(rotation, self.pose.translation)
+        return robots.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
+
+
+@dataclass(frozen=True)
+class SurfaceCoordinatesForm:
+    """The coordinates along a constraint.
+
+    Attributes:
+        constraint: The name of a constraint with coordinates, such as a PointOnSurface on a !Plane.
+    """
+
+    constraint: str
+
+    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
+        return robots.SurfaceCoordinates(_named(self.constraint, constraints))
+
+
+@dataclass(frozen=True)
+class TiltFromNormalForm:
+    """The tilt of a tool's axis from the surface normal at its contact.
+
+    Attributes:
+        constraint: The name of a constraint with a free side, such as a PointOnSurface.
+        axis: The axis of its frame, "x", "y" or "z".
+        components: The rows, a choice of the two other axes, "xy" for example; both if empty.
+    """
+
+    constraint: str
+    axis: str
+    components: str = ""
+
+    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
+        named = _named(self.constraint, constraints)
+        return robots.TiltFromNormal(named, self.axis, self.components)
+
+
+WrittenConstraint = Constraint | WeldedFramesForm
+WrittenOutput = PositionOutput | SurfaceCoordinatesForm | TiltFromNormalForm
+
+
+def make(
+    form: T | WeldedFramesForm | SurfaceCoordinatesForm | TiltFromNormalForm,
+    constraints: Sequence[Constraint],
+) -> T:
+    """The library's object of a form that may name constraints; such an object as it is."""
+    return cast(T, form.make(constraints) if hasattr(form, "make") else form)
+
+
+def _named(name: str, constraints: Sequence[Constraint]) -> Constraint:
+    named = {constraint.name: constraint for constraint in constraints}
+    if name not in named:
+        raise ModelError(unknown_name("constraint", name, named))
+    return named[name]
 
 
 _INTEGRATOR = {
@@ -97,16 +171,16 @@ class Scenario:
 
     description: str = field(default="", kw_only=True)
     robot: Robot
-    constraints: list[parts.WrittenConstraint] = field(default_factory=list)
-    compliances: dict[str, parts.Positive] | None = None
-    outputs: list[parts.WrittenOutput] = field(default_factory=list)
+    constraints: list[WrittenConstraint] = field(default_factory=list)
+    compliances: dict[str, Positive] | None = None
+    outputs: list[WrittenOutput] = field(default_factory=list)
     tool_axis: Literal["normal", "fixed", "free"] = "normal"
     forces: list[str | ForceOutput] | None = None
     actuation: list[Stage] = field(default_factory=list)
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
-    bounds: dict[str, Annotated[Any, form.INTERVAL]] = field(default_factory=dict)
+    bounds: dict[str, form.Interval] = field(default_factory=dict)
     exogenous: dict[str, list[Reference | float]] = field(default_factory=dict)
-    plant: plants.ScenarioPlant = field(default_factory=plants.IdealConstraints)
+    plant: parts.ScenarioPlant = field(default_factory=parts.IdealConstraints)
     law: parts.Law = field(default_factory=parts.Law)
     sampling: Sampling | None = None
     sensors: parts.Sensors = field(default_factory=parts.Sensors)
@@ -116,8 +190,8 @@ class Scenario:
     references: dict[str, Reference | float] = field(default_factory=dict)
     task: parts.ScenarioTask | None = None
     start: parts.Start = field(default_factory=parts.Start)
-    duration: Annotated[float, Field(gt=0.0)] = 10.0
-    integrator: Annotated[SimulatorConfig, AfterValidator(_valid)] = field(
+    duration: Positive = 10.0
+    integrator: Annotated[SimulatorConfig, AfterValidator(lambda c: check_config(c) or c)] = field(
         default_factory=lambda: SimulatorConfig(**{n: v for n, (v, _) in _INTEGRATOR.items()})
     )
     write: parts.Write = field(default_factory=parts.Write)
@@ -137,10 +211,16 @@ class Scenario:
         return isinstance(other, Scenario) and scenario_data(self) == scenario_data(other)
 
 
-def _family(*classes: type, plain: type | None = None) -> Family:
-    return Family({f"!{cls.__name__.removesuffix('Form')}": cls for cls in classes}, plain)
+def _family(room: Any, names: str, plain: type | None = None) -> Family:
+    forms = {f"!{name}": _FORMS.get(name) or getattr(room, name) for name in names.split()}
+    return Family(forms, plain)
 
 
+_FORMS = {
+    "WeldedFrames": WeldedFramesForm,
+    "SurfaceCoordinates": SurfaceCoordinatesForm,
+    "TiltFromNormal": TiltFromNormalForm,
+}
 _REFERENCES: dict[str, type] = {
     "!Constant": rs.ConstantReference,
     "!Sinusoids": rs.SinusoidReference,
@@ -151,46 +231,27 @@ _REFERENCES: dict[str, type] = {
     "!Waypoints": rs.WaypointsReference,
     "!Csv": rs.CsvReference,
 }
-# What stands in a scenario for the types in annotations. A new member is one line here.
+_SURFACES = "Plane Sphere Cylinder Ellipsoid Torus ImplicitSurface MeasuredSurface"
+_CONSTRAINTS = (
+    "PointOnSurface WeldedFrames CoincidentPoints FixedDistance JointCoupler RevoluteLoopJoint "
+    "PrismaticLoopJoint AxisNormalToSurface Blade RollingWheel RollingBall"
+)
+_OUTPUTS = "PointCoordinates AxisCoordinates SurfaceCoordinates TiltFromNormal JointPositions"
+_PLANTS = "IdealConstraints MultibodyPlant CompliantContact OwnPlant"
+# What stands in a scenario for the types in annotations. A new member is one name here.
 FAMILIES: dict[type, Family] = {
-    Surface: _family(
-        robots.Plane,
-        robots.Sphere,
-        robots.Cylinder,
-        robots.Ellipsoid,
-        robots.Torus,
-        robots.ImplicitSurface,
-        robots.MeasuredSurface,
-    ),
-    robots.Constraint: _family(
-        robots.PointOnSurface,
-        parts.WeldedFramesForm,
-        robots.CoincidentPoints,
-        robots.FixedDistance,
-        robots.JointCoupler,
-        robots.RevoluteLoopJoint,
-        robots.PrismaticLoopJoint,
-        robots.AxisNormalToSurface,
-        robots.Blade,
-        robots.RollingWheel,
-        robots.RollingBall,
-    ),
-    robots.PositionOutput: _family(
-        robots.PointCoordinates,
-        robots.AxisCoordinates,
-        parts.SurfaceCoordinatesForm,
-        parts.TiltFromNormalForm,
-        robots.JointPositions,
-    ),
-    ForceOutput: _family(robots.Squeeze, robots.ForceCombination, plain=str),
-    Stage: _family(robots.FlexibleJoints, robots.DcMotors, robots.ElectrohydraulicServos),
+    Surface: _family(robots, _SURFACES),
+    Constraint: _family(robots, _CONSTRAINTS),
+    PositionOutput: _family(robots, _OUTPUTS),
+    ForceOutput: _family(robots, "Squeeze ForceCombination", str),
+    Stage: _family(robots, "FlexibleJoints DcMotors ElectrohydraulicServos"),
+    Load: _family(robots, "KnownForce JointFriction"),
     Reference: Family(_REFERENCES, float),
-    Load: _family(robots.KnownForce, robots.JointFriction),
-    plants.ScenarioPlant: _family(
-        plants.IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
+    parts.ScenarioPlant: _family(
+        parts, "IdealConstraints MultibodyPlant CompliantContact OwnPlant"
     ),
-    parts.Poles: _family(parts.Poles, parts.Coefficients, parts.Matrices),
-    ps.Phase: _family(ps.Approach, ps.Press, ps.Move, ps.Dwell, ps.Release, ps.Retreat),
+    parts.Poles: _family(parts, "Poles Coefficients Matrices"),
+    Phase: _family(phases, "Approach Press Move Dwell Release Retreat"),
 }
 
 
@@ -250,7 +311,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """
     path = find_scenario(str(path))
     try:
-        text = read_text(path, 4 * typed_yaml.MOST_TEXT)
+        text = read_text(path, 4 * form.MOST_TEXT)
         is_shipped = path in shipped_scenarios().values()
         folder = Path().absolute() if is_shipped else path.absolute().parent
     except UnicodeDecodeError:
@@ -264,21 +325,21 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
             "and in one of your own it is robot.file"
         )
         raise ScenarioError((str(path), problem))
-    data, line_of = typed_yaml.load_lines(text, str(path))
+    data, line_of = form.load_lines(text, str(path))
     data = {} if data is None else data
     if isinstance(data, dict):
         # Drake's convention: keys with an underscore are a place for anchors.
-        data = {key: data[key] for key in data if key == typed_yaml.TAG or not key.startswith("_")}
+        data = {key: data[key] for key in data if key == form.TAG or not key.startswith("_")}
     changed = []
     for setting in settings:
         key, separator, value = setting.partition("=")
         if not separator or not all(key.split(".")):
             raise ScenarioError((f"--set {setting}", "expected key=value, for example duration=5"))
-        scenario_reader().put(data, key, typed_yaml.load_yaml(value, key))
+        scenario_reader().put(data, key, form.load_yaml(value, key))
         changed.append(key)
 
     def place_of(key: str) -> str:
-        line = None if typed_yaml.first_name(changed, key) is not None else line_of(key)
+        line = None if form.first_name(changed, key) is not None else line_of(key)
         return "" if line is None else f"[{path.name}:{line}]"
 
     return scenario_reader().read(data, folder, place_of)
@@ -287,4 +348,4 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
     """Writes what differs from defaults, after a first line "# ..." that may be empty."""
     head = f"{comment}\n" if comment else ""
-    Path(path).write_text(head + typed_yaml.dump_yaml(scenario_data(scenario)), encoding="utf-8")
+    Path(path).write_text(head + form.dump_yaml(scenario_data(scenario)), encoding="utf-8")

@@ -31,7 +31,7 @@ from drake_dae.scene.surroundings import (
     scene_points,
     surroundings,
 )
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plant import Plant
 
 FRAME_RATE = 32.0
 """Frames per second of the live view and of the recording."""

@@ -27,9 +27,8 @@ from drake_dae.errors import (
 from drake_dae.running.rollout_program import program_of
 from drake_dae.running.simulate import simulate
 from drake_dae.running.summary import figures_of
-from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.build import build_completed, for_rollout, roll_scenario
 from drake_dae.scenario.parts import Matrices
-from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import Scenario, read_scenario, varied_data
 from drake_dae.scenario.start import start_scenario
 from drake_dae.studies.variations import Variation

@@ -30,8 +30,8 @@ from drake_dae.blocks.machine import num_cores
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running.interruption import end_at_once, ending_signals
 from drake_dae.running.simulate import default_size
+from drake_dae.scenario.build import for_rollout
 from drake_dae.scenario.model import complete_scenario
-from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data, varied_data
 from drake_dae.studies.runs import Outcome, Runner, RunResult, run_one, structure_of
 from drake_dae.studies.study import Study

@@ -14,7 +14,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.typed_yaml import load_yaml
+from drake_dae.scenario.form import load_yaml
 
 MOST_RUNS = 1_000_000  # The largest number of runs of a sweep; more would take weeks.
 Variation = dict[str, Any]  # Dotted key of a scenario -> its value in one run, as plain data.

@@ -211,15 +211,6 @@ class TracedFunction:
         fault = FailureKind.SINGULAR if is_singular else FailureKind.VALUE
         return Failure(self.name, fault, {}, self._regular)
 
-    def derivative(self, output: int, inputs: Sequence[int]) -> "TracedFunction":
-        """Returns the function of the derivatives of an output by some inputs, side by side."""
-        symbols = dict(zip(self.input_names, self._symbols, strict=True))
-        by = [self.input_names[i] for i in inputs]
-        value = ca.vec(self._expressions[output])
-        slope = ca.jacobian(ca.cse(value), ca.vertcat(*[symbols[name] for name in by]))
-        name = f"{self.output_names[output]} of {self.name}, differentiated by {' and '.join(by)}"
-        return TracedFunction(name, symbols, {"slope": slope}, often=False)
-
     def __call__(self, *arguments: ArrayLike) -> tuple[FloatArray, ...]:
         """Evaluates the function and returns new arrays."""
         if len(arguments) != self._num_inputs:

@@ -27,7 +27,7 @@ import numpy as np
 import drake_dae as dd
 from drake_dae.errors import DrakeDaeError
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.plants import IdealConstraints
+from drake_dae.scenario.parts import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario

@@ -14,7 +14,7 @@ from drake_dae.running.judgement import FindingKind
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
-from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.references import ReferenceGenerator
 
 TIMES = np.linspace(0.0, 2.0, 401)
 AMPLITUDE, FREQUENCY, FORCE = 0.2, 15.0, 20.0

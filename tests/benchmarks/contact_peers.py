@@ -29,7 +29,7 @@ from scipy.linalg import eigh
 from drake_dae import ContactPlant, Encoders, ReferenceGenerator, load_scenario, simulate
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import DrakeDaeError
-from drake_dae.scenario import plants
+from drake_dae.scenario import parts
 from drake_dae.scenario.build import build_completed, make_plant
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import scenario_model, scenario_structure
@@ -302,7 +302,7 @@ class MeasuredPlant(ContactPlant):
         self._noise.SetRandomContext(noise, RandomGenerator(1))
 
 
-class _Measured(plants.MultibodyPlant):
+class _Measured(parts.MultibodyPlant):
     """The plant of a scenario, as a `MeasuredPlant`."""
 
     def plant(self, *robot):

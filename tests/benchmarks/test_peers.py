@@ -17,7 +17,7 @@ from timing import calls, times
 from two_arms import GRASP, two_arms
 
 from drake_dae import CoincidentPoints, DaePlant, JointPositions, RobotModel
-from drake_dae.systems.plants.dae_plant import dae_block
+from drake_dae.systems.ideal_plants import dae_block
 from drake_dae.trace.functions import TracedFunction
 
 HELD = np.array([0.0, -0.1938, 0.0, -1.936, 0.0, 0.559, 0.0])

@@ -7,8 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.errors import MachineCodeError
-from drake_dae.trace.compiled import generate, library, without_branches
-from drake_dae.trace.compiler import find_compiler
+from drake_dae.trace.compiled import find_compiler, generate, library, without_branches
 from drake_dae.trace.functions import TracedFunction
 
 STATES = 200

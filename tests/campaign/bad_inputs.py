@@ -19,11 +19,11 @@ from campaign.outcomes import RAW, REFUSED, Outcome, checked
 
 from drake_dae import Record, build_scenario, load_scenario, simulate
 from drake_dae.cli import main
+from drake_dae.scenario.form import dump_yaml, load_yaml
 from drake_dae.scenario.robot_file.reading import finalize, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import FOLDER, shipped_scenarios
-from drake_dae.scenario.typed_yaml import dump_yaml, load_yaml
-from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.ideal_plants import DaePlant
 
 ROBOTS = Path(__file__).parents[1] / "scenario" / "robots"
 URDFS = {"two_link_arm": "two_link_wall", "five_bar": "five_bar"}

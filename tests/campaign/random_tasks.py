@@ -14,8 +14,7 @@ import numpy as np
 from campaign.outcomes import HANG, REFUSED, WRONG, Outcome, checked
 
 from drake_dae import load_scenario
-from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.build import build_completed, roll_scenario
 from drake_dae.scenario.start import start_scenario
 
 ENDED = ("done", "held")

@@ -1,20 +1,17 @@
 """Linear models against each other by their transfer functions, and against closed forms."""
 
+import casadi as ca
 import numpy as np
 import pytest
-import scipy.linalg
 from arms import arm, law
+from numpy.testing import assert_allclose
 from problems import PROBLEMS, hanging_pendulum
+from pydrake.systems.framework import InputPortSelection, OutputPortSelection
+from pydrake.systems.primitives import Linearize
+from scipy.signal import cont2discrete
 
-from drake_dae.dae import (
-    DaeSystem,
-    Linearization,
-    TrackingLaw,
-    find_structure,
-    linearize,
-    linearize_loop,
-    poles,
-)
+import drake_dae as dd
+from drake_dae.dae import DaeSystem, TrackingLaw, find_structure, linearize, poles
 
 Array = np.ndarray
 
@@ -58,30 +55,35 @@ def test_both_forms_have_the_same_transfer_functions(system, x, u):
     assert names == [system.state_signals[i].name for i in found.coordinates]
 
 
-@pytest.mark.parametrize("name", ["pendulum", "two_link_arm", "circuit", "flexible_pendulum"])
-def test_a_closed_loop_follows_its_reference(name):
-    """With r^(j) = s^j r the outputs are r, whatever the poles: the error (30) has no input."""
-    system = PROBLEMS[name]().system
-    tracking = TrackingLaw(system, poles(-3.0))
-    layout = tracking.layout
-    structure = tracking.structure
-    chain = tracking.error_coordinates(structure.states[0], np.zeros(layout.reference_size))
-    reference = np.zeros(layout.reference_size)
-    reference[layout.chained] = chain
-    # Constant outputs; where that is no rest, the motion with them is taken in its own right.
-    found = linearize_loop(tracking, reference, structure.states[0])
-    check_identity(found, layout.degrees)
-    values = np.linalg.eigvals(found.minimal.A)
-    # The error coordinates are coordinates of N* as well: the poles of (32) are among the rest.
-    for degree in layout.degrees:
-        if degree:
-            assert np.sum(np.abs(values + 3.0) < 1e-3 * 3.0 ** (1 / degree)) >= 1
+@pytest.mark.parametrize("period", [0.05, 0.4])
+def test_drake_s_tools_give_the_poles_of_a_loop(period):
+    """x'' = u and z = x, u = -w^2 x - 2 w x': continuous, and sampled, late by one period."""
+    w, x, none = 4.0, ca.SX.sym("x", 2), ca.SX(0, 1)
+    system = DaeSystem(x, ca.vertcat(x[1], 0), ca.SX(2, 0), ca.SX([0, 1]), none, x[0], ca.SX(1, 0))
+    tracking = TrackingLaw(system, poles(-w))
+    loop = dd.make_closed_loop(dd.DaePlant(system), tracking, [dd.ConstantReference(0.0)])
+    whole = dd.TracedSystem(
+        dd.compile_diagram(loop.diagram, context=loop.diagram.CreateDefaultContext())
+    )
+    none_at_all = InputPortSelection.kNoInput, OutputPortSelection.kNoOutput
+    continuous = Linearize(whole, whole.CreateDefaultContext(), *none_at_all)
+    # A double pole moves by the root of round-off.
+    assert_allclose(np.poly(continuous.A()), np.poly([-w, -w]), atol=1e-12)
 
-
-def check_identity(found: Linearization, degrees: tuple[int, ...]) -> None:
-    for s in FREQUENCIES:
-        powers = scipy.linalg.block_diag(
-            *[np.array([[s**j] for j in range(degree + 1)]) for degree in degrees]
-        )
-        response = found.minimal.response(s) @ powers
-        np.testing.assert_allclose(response, np.eye(len(degrees)), rtol=0, atol=1e-8)
+    controller = dd.TrackingController(tracking)
+    context = controller.CreateDefaultContext()
+    controller.GetInputPort("estimated_state").FixValue(context, np.zeros(2))
+    controller.GetInputPort("reference").FixValue(context, np.zeros(3))
+    state = controller.GetInputPort("estimated_state").get_index()
+    gain = Linearize(
+        controller, context, state, controller.GetOutputPort("control").get_index()
+    ).D()
+    found = linearize(system, np.zeros(2))
+    gain = gain @ found.basis
+    model = found.minimal
+    A, B, *_ = cont2discrete((model.A, model.B, model.C, model.D), period)
+    late = np.block([[A, B], [gain, np.zeros((1, 1))]])
+    # By hand: x_(k+1) = x_k + T x'_k + T^2 / 2 u_(k-1).
+    T = period
+    expected = [[1.0, T, T * T / 2], [0.0, 1.0, T], [-w * w, -2.0 * w, 0.0]]
+    assert_allclose(np.poly(late), np.poly(expected), rtol=1e-12)

@@ -19,7 +19,6 @@ def swing_eigenvalues() -> np.ndarray:
 EIGENVALUES = {
     "swing_network": swing_eigenvalues(),
     "aircraft": np.array([np.sqrt(2.0), -np.sqrt(2.0)]),
-    "dc_motor": np.array([-0.8]),
 }
 
 

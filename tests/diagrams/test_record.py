@@ -207,4 +207,4 @@ def test_what_a_notebook_shows():
     assert repr(record) == (
         "Record(3 times from 0 to 0.3 s, signals=[state (2), constraint_force (0)])"
     )
-    assert repr(Record(np.zeros(0), {})) == "Record(empty, signals=[])"
+    assert repr(Record(np.zeros(0), {})) == "Record(0 times, signals=[])"

@@ -6,8 +6,7 @@ from found_places import found_off
 from programs import loaded
 
 from drake_dae import load_scenario
-from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.rolled import for_rollout, roll_scenario
+from drake_dae.scenario.build import build_completed, for_rollout, roll_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
 

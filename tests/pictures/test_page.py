@@ -14,7 +14,7 @@ from drake_dae.cli import main
 from drake_dae.errors import MachineCodeError
 from drake_dae.pictures.page import page as module
 from drake_dae.scenario import build_commanded
-from drake_dae.scenario.rolled import for_rollout, roll_scenario
+from drake_dae.scenario.build import for_rollout, roll_scenario
 
 needs_zig = pytest.mark.skipif(find_spec("ziglang") is None, reason="there is no ziglang")
 

@@ -19,12 +19,11 @@ from drake_dae import (
     Squeeze,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots import ConstraintSet, NamedForce, as_force_outputs, force_rows
+from drake_dae.robots import ConstraintSet, as_force_outputs, force_rows
 from drake_dae.scenario.model import scenario_model
 from drake_dae.trace.functions import TracedFunction
 
 MEMBERS = {
-    "name": NamedForce("grip2.fz"),
     "combination": ForceCombination({"grip1.fz": 0.5, "grip3.fz": -0.5}, "share"),
     "squeeze": Squeeze("object", "grip1", "grip2"),
     "squeeze of the fingers": Squeeze("finger1::tip", "grip1", "other", name="pinch"),
@@ -79,7 +78,9 @@ def test_rows_of_names_and_combinations_are_their_weights():
     expected = np.zeros((1, bound().size))
     expected[0, [2, 8]] = 0.5, -0.5
     np.testing.assert_array_equal(rows(MEMBERS["combination"], q), expected)
-    np.testing.assert_array_equal(rows(MEMBERS["name"], q), np.eye(bound().size)[[5]])
+    (named,) = as_force_outputs(["grip2.fz"], bound())
+    assert named.signals(bound()) == (Signal("grip2.fz", "N"),)
+    np.testing.assert_array_equal(rows(named, q), np.eye(bound().size)[[5]])
 
 
 @pytest.mark.parametrize("name", ["squeeze", "squeeze of the fingers"])
@@ -108,7 +109,6 @@ def test_a_squeeze_is_half_the_force_toward_the_other_contact(name):
 @pytest.mark.parametrize(
     ("output", "message"),
     [
-        (NamedForce("grip2.f"), "'grip2.f'"),
         (ForceCombination({"grip2.f": 1.0}, "a"), "'grip2.f'"),
         (Squeeze("object", "grip1", "grip4"), "'grip4'"),
         (Squeeze("finger1::tip", "grip1", "grip2"), "'grip2'.*'finger1::tip'"),

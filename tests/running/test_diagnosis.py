@@ -12,8 +12,7 @@ from runs import scenario
 from drake_dae import DaePlant, DaeSystem, simulate
 from drake_dae.errors import SimulationError, SingularityError, WiringError
 from drake_dae.running.diagnosis import RunWatch, fastest_rate
-from drake_dae.scenario.build import build_scenario
-from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.build import build_scenario, roll_scenario
 
 REACH = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 3}"
 """Two links of 1 m reach z = 1.6 m on the wall at x = 1.2 m."""

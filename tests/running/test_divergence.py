@@ -11,8 +11,7 @@ from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
 from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.simulate import simulate
-from drake_dae.scenario.build import build_scenario
-from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.build import build_scenario, roll_scenario
 from tests.support.runs import scenario
 
 LATE = "sampling={period: %g, delay: %g}"

@@ -9,7 +9,7 @@ from drake_dae import Record, Signal
 from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
 from drake_dae.running.judgement import FindingKind, Judgement, Outcome, late_rms
-from drake_dae.systems.control.contract import PhaseChange
+from drake_dae.systems.controller import PhaseChange
 
 TIMES = np.linspace(0.0, 10.0, 1001)
 WALL = Signal("wall.force", "N")

@@ -12,14 +12,13 @@ from runs import scenario
 from drake_dae import build_scenario, contact_gains, load_scenario, simulate
 from drake_dae.cli import main
 from drake_dae.dae import Parameter, advised_gains
-from drake_dae.dae.beyond.disturbance import estimated_within
+from drake_dae.dae.disturbance import estimated_within
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario import build, plants
+from drake_dae.scenario import build
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.estimated import estimates_all, with_all_estimated
 from drake_dae.scenario.expected import sensed_contact, stated_errors
-from drake_dae.scenario.gains import advised
+from drake_dae.scenario.gains import advised, estimates_all, with_all_estimated
 from drake_dae.scenario.judging import find_feasibility, judge_run
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario, save_scenario
@@ -274,7 +273,7 @@ def test_gains_without_a_margin_are_told():
 
 
 def test_ideal_plants_are_not_advised():
-    found = replace(two_link(), plant=plants.IdealConstraints())
+    found = replace(two_link(), plant=parts.IdealConstraints())
     model = scenario_model(found)
     assert advised(found, model, scenario_structure(model)).scenario is found
 

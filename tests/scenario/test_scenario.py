@@ -16,7 +16,12 @@ from drake_dae.references import PathLimits
 from drake_dae.robots import Blade, RollingBall
 from drake_dae.scenario import parts as forms
 from drake_dae.scenario.robot_file.robot import Pose, Robot
-from drake_dae.scenario.scenario import Scenario, save_scenario
+from drake_dae.scenario.scenario import (
+    Scenario,
+    SurfaceCoordinatesForm,
+    WeldedFramesForm,
+    save_scenario,
+)
 from drake_dae.scenario.shipped import find_scenario
 
 LIMITS = PathLimits(0.2, 1.0)
@@ -38,7 +43,7 @@ def test_every_form_reads_back_equal(tmp_path):
                 dd.PointOnSurface("a", surface, (0.1, 1e-17, -0.0), f"c{i}")
                 for i, surface in enumerate(surfaces)
             ],
-            forms.WeldedFramesForm("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
+            WeldedFramesForm("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
             dd.CoincidentPoints("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), "zx", "p"),
             dd.FixedDistance("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), 1 / 3, "r"),
             dd.JointCoupler("a", "b", -1 / 3, 0.1, "m", "j"),
@@ -50,7 +55,7 @@ def test_every_form_reads_back_equal(tmp_path):
         outputs=[
             dd.PointCoordinates("yes", "xy"),
             dd.AxisCoordinates("b", "z", "xy"),
-            forms.SurfaceCoordinatesForm("c0"),
+            SurfaceCoordinatesForm("c0"),
             dd.JointPositions(["joint1", "2"]),
         ],
         forces=[
@@ -193,7 +198,7 @@ def test_weld():
         find_scenario("two_arms"),
         ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
     )
-    assert plain.constraints[0] == forms.WeldedFramesForm("left::tool", "right::tool", Pose())
+    assert plain.constraints[0] == WeldedFramesForm("left::tool", "right::tool", Pose())
 
 
 TILTED = (

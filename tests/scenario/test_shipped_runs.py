@@ -7,9 +7,9 @@ from runs import DEAR, IN_CONTACT, scenario_validator, some, untagged
 from scenario_texts import run
 
 from drake_dae import load_scenario
+from drake_dae.scenario.form import load_yaml
 from drake_dae.scenario.scenario import save_scenario
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
-from drake_dae.scenario.typed_yaml import load_yaml
 
 RIGID = ["two_link_wall", "seven_joint_wall", "seven_joint_dome", "two_arms", "five_bar"]
 ACTUATED = {

@@ -15,9 +15,8 @@ from drake_dae import Record, build_scenario, load_scenario, shipped_model
 from drake_dae.cli import main
 from drake_dae.diagrams.record import phase_spans
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.build import build_completed, roll_scenario
 from drake_dae.scenario.judging import find_feasibility
-from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
 
 

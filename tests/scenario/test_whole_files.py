@@ -9,8 +9,8 @@ from scenario_texts import written
 
 from drake_dae import load_scenario
 from drake_dae.errors import GeometryWarning, ScenarioError
+from drake_dae.scenario.form import load_yaml
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.typed_yaml import load_yaml
 
 ROBOTS = Path(__file__).parent / "robots"
 

@@ -8,7 +8,7 @@ from drake_dae import build_scenario
 from drake_dae.analysis import robot_limits
 from drake_dae.errors import ScenarioError
 from drake_dae.running.summary import figures_of
-from drake_dae.scenario.rolled import for_rollout, roll_scenario
+from drake_dae.scenario.build import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
 from drake_dae.scenario.start import start_scenario
 from drake_dae.studies.runs import Outcome, Runner, structure_of

@@ -21,7 +21,7 @@ from drake_dae.robots import (
     diagonal_parameter,
 )
 from drake_dae.systems import Controller, Plant
-from drake_dae.systems.task.phases import Condition, Phase
+from drake_dae.systems.phases import Condition, Phase
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from drake_dae.diagrams import LoopSettings, wire_loop
 from drake_dae.robots import KnownForce
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.systems import PointMaterial, open_contact
-from drake_dae.systems.task.phases import Phase
+from drake_dae.systems.phases import Phase
 
 SPEED, OVER, FAR = 0.05, 0.2, 0.02
 POLE = -8.0

@@ -13,7 +13,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
 from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
-from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.build import roll_scenario
 from drake_dae.scenario.scenario import Scenario, scenario_schema
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 

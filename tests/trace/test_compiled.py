@@ -12,8 +12,7 @@ import pytest
 
 from drake_dae import DaeSystem
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
-from drake_dae.trace.compiled import attempts
-from drake_dae.trace.compiler import find_compiler
+from drake_dae.trace.compiled import attempts, find_compiler
 from drake_dae.trace.functions import TracedFunction
 
 needs_compiler = pytest.mark.skipif(
@@ -117,7 +116,7 @@ def test_where_no_compiler_works(cache, monkeypatch, tmp_path):
     runs_interpreted(re.escape(str(tmp_path)))
     monkeypatch.delenv("CC")
     monkeypatch.setenv("PATH", "/nowhere")
-    monkeypatch.setattr("drake_dae.trace.compiler.find_spec", lambda name: None)
+    monkeypatch.setattr("drake_dae.trace.compiled.find_spec", lambda name: None)
     runs_interpreted("'cc'")
     assert not list(cache.glob("*"))
 
@@ -131,7 +130,7 @@ def test_a_compiler_that_hangs_is_waited_for_once(cache, monkeypatch, tmp_path):
         asked.write_text("")
         monkeypatch.setenv("CC", script(tmp_path / name, does))
         # Long enough for a process to start; what it waits for never comes.
-        monkeypatch.setattr("drake_dae.trace.compiler.ANSWERS", 1.0)
+        monkeypatch.setattr("drake_dae.trace.compiled.ANSWERS", 1.0)
         monkeypatch.setattr("drake_dae.trace.compiled.HANGS", (1.0, 1.0))
         runs_interpreted(name)
         before = asked.read_text()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_dae.trace.newton import newton, shortest_steps
+from drake_dae.trace.numerics import newton, shortest_steps
 
 Array = np.ndarray
 

@@ -12,9 +12,9 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal, poles
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import GainError
-from drake_dae.systems.control.commanded import CommandedReferences
-from drake_dae.systems.control.contract import SIGNAL, Controller
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.controller import SIGNAL, Controller
+from drake_dae.systems.plant import Plant
+from drake_dae.systems.references import CommandedReferences
 
 # The largest speed, in m/s, of a surface whose motion is not in the law's model.
 MAX_SURFACE_SPEED = 0.05

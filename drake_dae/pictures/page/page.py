@@ -31,7 +31,7 @@ from drake_dae.pictures.page.controls import (
 from drake_dae.pictures.page.scene import RobotScene, meshcat_page, scene_size
 from drake_dae.running.c_code import BlockCode
 from drake_dae.running.export import check_traced, write_loop
-from drake_dae.trace.compiler import compile_webassembly
+from drake_dae.trace.compiled import compile_webassembly
 
 WEB = Path(__file__).with_name("web")
 

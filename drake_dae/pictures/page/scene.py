@@ -20,7 +20,7 @@ from drake_dae.robots import (
 from drake_dae.scene.arrows import path_of
 from drake_dae.scene.surroundings import scene_points
 from drake_dae.scene.view import draw_scene, start_unwatched_meshcat, view_of_links
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plant import Plant
 
 _BACKGROUND = [0.97, 0.97, 0.98]
 

@@ -1,12 +1,13 @@
 """Copies of a robot's files, mended so that Drake's parser reads them as their authors mean them.
 
-A copy has possible inertias, and geometry that can be read and drawn; it lacks what Drake does not
-read. What changed on the way is collected, and so is what is lost.
+A copy has possible inertias, and geometry that can be read and drawn; it lacks what is not read.
+What changed on the way is collected, and so is what is lost.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Collection
+from collections.abc import Iterator, Mapping
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
@@ -17,16 +18,18 @@ from pydrake.multibody.tree import RotationalInertia
 
 from drake_dae.arrays import FloatArray, number_in
 from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning
-from drake_dae.scenario.robot_file import mjcf
-from drake_dae.scenario.robot_file.files import RobotFiles, drawable
-from drake_dae.scenario.robot_file.read_by_drake import DRIVES, READ_BY_DRAKE, take_lost
-from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.robot_file.xml_tree import check_included, read_xml, write_xml
+from drake_dae.scenario.robot_file.read_by_drake import (
+    DRIVES,
+    READ_BY_DRAKE,
+    place_of,
+    read_xml,
+    take_lost,
+    write_xml,
+)
+from drake_dae.scenario.robot_file.robot import Robot, RobotFiles, drawable
 
-_ROUND = {"radius": 1, "length": 1}
-_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "capsule": _ROUND}
-_SIZES |= {"ellipsoid": {}, "mesh": {}}
-"""Shape -> how many numbers its sizes have, in URDF and SDFormat."""
+ARMATURE = "joint/armature"
+"""Rotor inertia of MJCF. Drake gives it to motors only."""
 
 _OF_MANY_AXES = ("planar", "floating", "universal", "ball", "free")
 """Types of joints that no motor drives, and that follow no other joint."""
@@ -34,89 +37,97 @@ _OF_MANY_AXES = ("planar", "floating", "universal", "ball", "free")
 _FLAT = 1e-8
 """A scale of a mesh up to which Drake takes none."""
 
+_EMPTY, _UNREAD = "has size 0", "has a shape that Drake does not read"
+
+_ROUND = {"radius": 1, "length": 1}
+_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "capsule": _ROUND}
+_SIZES |= {"ellipsoid": {}, "mesh": {}}
+"""Shape -> how many numbers its sizes have; those of a geom of MJCF are in one list."""
+
+_MOST_INCLUDED = 1000
+"""The largest number of files that an MJCF file includes: each may include another one twice."""
+
+_TURNS = {"quat", "axisangle", "euler", "xyaxes", "zaxis"}
+
+_ONE_DEFAULT = {
+    "actuator": ["general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"],
+    "equality": ["equality"],
+}
+"""Parents in MJCF whose elements have one default -> the names under which it is written."""
+
+_SERVOS = ("position", "velocity", "intvelocity", "general")
+"""Actuators whose control is no effort, while their range of forces limits an effort."""
+
+_LAW = ("dyntype", "gaintype", "biastype")
+
+_OF_GENERAL = {*_LAW, "dynprm", "gainprm", "biasprm"}
+"""What motors and servos set themselves, whatever is the default."""
+
 
 class Mender:
     """Makes mended copies of files. A "model" is the name of a model instance, "" for a lone robot.
 
-    `folder` is an empty one for the copies, None to make none; `shapes` has "read" if geometry is
-    read, and "drawn" if it is converted to be drawn.
+    `folder` is an empty one for the copies, None to make none; with `has_geometry` geometry is
+    read, and with `drawn` converted to be drawn.
     """
 
     def __init__(
-        self, files: RobotFiles, robot: Robot, folder: Path | None, shapes: Collection[str] = ()
+        self, files: RobotFiles, robot: Robot, folder: Path | None, has_geometry: bool, drawn: bool
     ) -> None:
         self.files, self.leave_out, self.folder = files, robot.leave_out, folder
         self.drives = robot.actuators is None  # Else the file's motors do not count.
-        self.has_geometry, self.drawn = "read" in shapes, "drawn" in shapes
+        self.has_geometry, self.drawn = has_geometry, drawn
+        # Links that the scenario places, so that no joint fixes them to the world.
+        self.placed = {*robot.free, *([robot.base.weld] if robot.base is not None else [])}
         # Category of a warning and its text -> what it concerns; part that is lost -> where.
         self.told: dict[tuple[type[Warning], str], list[str]] = defaultdict(list)
         self.lost: dict[str, list[str]] = defaultdict(list)
         self.originals: dict[Path, Path] = {}  # Copy -> its file.
-        # "effort" limit, "armature", "follows" (leader, ratio, offset), "parent" of SDFormat ->
-        # (model, joint) -> value.
-        self.joints: dict[str, dict[tuple[str, str], Any]] = defaultdict(dict)
+        # (model, joint) -> "effort" limit, "armature", "follows" (leader, ratio, offset), and the
+        # frame that is its "parent" in SDFormat.
+        self.joints: dict[tuple[str, str], dict[str, Any]] = defaultdict(dict)
         # Joints that the copies lack: model, name, child, and the frame that is their origin.
         self.floating: list[tuple[str, str, str, str]] = []
         self.crossed: set[tuple[str, str]] = set()  # (model, link) without a visual shape.
 
-    def copy(
-        self,
-        file: Path,
-        model: str = "",
-        placed: Collection[str] = (),
-        within: tuple[Path, ...] = (),
-    ) -> Path:
-        """A mended copy of a file; one that is neither URDF, SDFormat nor MJCF stays.
-
-        `placed` are links that the scenario places, so that no joint fixes them to the world, and
-        `within` the files that include this one.
-        """
+    def copy(self, file: Path, model: str = "") -> Path:
+        """A mended copy of a file; one that is neither URDF, SDFormat nor MJCF stays."""
         kind = file.suffix
         if kind not in READ_BY_DRAKE:
             return file
-        check_included(file, within)
-        root = read_xml(file)
-        if kind == ".xml":
-            for servo in mjcf.expand(root, file):
-                text = "servos become motors without their gains: controls are efforts"
-                self.tell(text, f"'{servo}'")
-        parents = {child: parent for parent in root.iter() for child in parent}
-
-        def place(node: Element) -> str:
-            """The line and name of an element, or of that to which it belongs."""
-            line = getattr(node, "line", 0)
-            while not node.get("name") and node in parents:
-                node = parents[node]
-            return f"{file.name}{f':{line}' * bool(line)}: {node.tag} '{node.get('name', '')}'"
-
-        for node in root.iter():
-            for value in (*node.attrib.values(), node.text or ""):
-                if "$(" in value or "${" in value:
-                    way = "is a template: xacro FILE -o robot.urdf writes the URDF"
-                    raise ModelError(f"{place(node)}: '{value.strip()}' {way}")
-                if "," in value and number_in(value.replace(",", ".", 1)) is not None:
-                    raise ModelError(f"{place(node)}: '{value}': numbers have a point, no comma")
-        # Only the armature of joints without motor is lost.
-        for one in take_lost(root, kind, {*self.leave_out} - {mjcf.ARMATURE}):
-            where = place(one.owner)
-            if one.is_told:
-                self.tell("Drake does not read, and leaves out", f"{where}: {one.part} {one.value}")
-            else:
-                self.lose(one.part, where)
-        for inertial in root.iter("inertial"):
-            if text := _mend_inertia(inertial, kind, place(inertial)):
-                self.lose("inertia", text)
-                self.tell("moments of inertia of no body become possible ones", text)
-        for joint in root.iter("joint"):
-            self._mend_limits(joint, place(joint))
-        if kind == ".urdf":
-            self._mend_urdf(root, file, model, placed)
-        elif kind == ".sdf":
+        with self.files.within(file):
+            root = read_xml(file)
+            if kind == ".xml":
+                self._expand(root, file)
+            for node in root.iter():
+                for value in (*node.attrib.values(), node.text or ""):
+                    if "$(" in value or "${" in value:
+                        way = "is a template: xacro FILE -o robot.urdf writes the URDF"
+                        raise ModelError(f"{place_of(node)}: '{value.strip()}' {way}")
+                    if "," in value and number_in(value.replace(",", ".", 1)) is not None:
+                        text = f"'{value}': numbers have a point, no comma"
+                        raise ModelError(f"{place_of(node)}: {text}")
+            # Only the armature of joints without motor is lost.
+            for part, value, owner, is_told in take_lost(
+                root, kind, {*self.leave_out} - {ARMATURE}
+            ):
+                if is_told:
+                    item = f"{place_of(owner)}: {part} {value}"
+                    self.tell("Drake does not read, and leaves out", item)
+                else:
+                    self.lose(part, place_of(owner))
+            for inertial in root.iter("inertial"):
+                if text := _mend_inertia(inertial, kind):
+                    self.lose("inertia", text)
+                    self.tell("moments of inertia of no body become possible ones", text)
             for joint in root.iter("joint"):
-                self._mend_axes(joint, place(joint))
-            self._mend_sdf(root, file, model, placed, (*within, file.resolve()))
-        else:
-            self._mend_mjcf(root, file, model, placed)
+                self._mend_limits(joint)
+            if kind == ".urdf":
+                self._mend_urdf(root, file, model)
+            elif kind == ".sdf":
+                self._mend_sdf(root, file, model)
+            else:
+                self._mend_mjcf(root, file, model)
         if self.folder is None:
             return file
         copy = self.folder / str(len(self.originals)) / file.name
@@ -132,33 +143,45 @@ class Mender:
         if part not in self.leave_out and (self.drives or not part.startswith(DRIVES)):
             self.lost[part].append(item)
 
-    def _mend_limits(self, joint: Element, place: str) -> None:
-        """Removes limits that Drake refuses, and those of joints that have none."""
+    def _mend_limits(self, joint: Element) -> None:
+        """Removes limits that Drake refuses, those of joints that have none, and speeds of 0."""
         is_continuous = joint.get("type") == "continuous"
         for owner in (joint, *joint.iterfind("limit"), *joint.iterfind("*/limit")):
-            sides = [owner.get(side) or owner.findtext(side) or "" for side in ("lower", "upper")]
-            bounds = [number_in(word) for word in owner.get("range", "").split() or sides]
+            keys = ("lower", "upper", "velocity")
+            sides = [owner.get(key) or owner.findtext(key) or "" for key in keys]
+            bounds = [number_in(word) for word in owner.get("range", "").split() or sides[:2]]
             low, high = bounds if len(bounds) == 2 else (None, None)
             is_reversed = low is not None and high is not None and low > high
             if is_reversed and not is_continuous:
-                self.lose("empty_limits", f"{place}: limits from {low:g} to {high:g}")
-            for key in ("range", "lower", "upper") if is_reversed or is_continuous else ():
+                self.lose("empty_limits", f"{place_of(joint)}: limits from {low:g} to {high:g}")
+            is_empty = low is not None and low == high and "empty_limits" in self.leave_out
+            gone = ["range", *keys[:2]] if is_continuous or is_reversed or is_empty else []
+            # Many authors write 0 for an unknown speed.
+            for key in (*gone, *keys[2:] * (number_in(sides[2]) == 0.0)):
                 owner.attrib.pop(key, None)
                 _remove(owner, key)
 
     def _follow(self, model: str, joint: Element, tag: str) -> None:
         """Takes out what a joint follows, unless Drake reports what is wrong."""
         name = joint.get("name", "")
-        for mimic in [part for part in joint if part.tag == tag]:
-            ratio = number_in(mimic.get("multiplier", "1"))
-            offset = number_in(mimic.get("offset", "0"))
+        for mimic in joint.findall(tag):
+            numbers = (mimic.get("multiplier", "1"), mimic.get("offset", "0"))
+            ratio, offset = map(number_in, numbers)
             if joint.get("type") in _OF_MANY_AXES:
                 self.lose(f"joint/{tag}", f"joint '{name}'")
             elif ratio is not None and offset is not None and "joint" in mimic.attrib:
                 joint.remove(mimic)
-                self.joints["follows"][model, name] = (mimic.get("joint"), ratio, offset)
+                self.joints[model, name]["follows"] = (mimic.get("joint"), ratio, offset)
                 if ratio == 0.0:
                     self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
+
+    def _float(self, model: str, name: str, child: str, origin: str) -> None:
+        self.floating.append((model, name, child, origin))
+        kind = (
+            "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place "
+            "of a quaternion, and must not pitch by 90 degrees"
+        )
+        self.tell(kind, f"'{name}'")
 
     # Geometry.
 
@@ -214,9 +237,9 @@ class Mender:
                 if _remove(material, "texture") + _remove(material, "drake:diffuse_map"):
                     self.tell("textures are left out", f"of '{name}'", GeometryWarning)
 
-    # URDF.
+    # URDF and SDFormat.
 
-    def _mend_urdf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
+    def _mend_urdf(self, root: Element, file: Path, model: str) -> None:
         root.attrib.setdefault("name", file.stem)
         _remove(root, "mujoco")
         for link in root.iterfind("link") if self.has_geometry else ():
@@ -236,23 +259,24 @@ class Mender:
             name, kind = joint.get("name", ""), joint.get("type")
             ends = joint.find("parent"), joint.find("child")
             parent, child = ("" if end is None else end.get("link", "") for end in ends)
+            is_placed = parent == "world" and child in self.placed
             if kind == "fixed":
                 _remove(joint, "mimic")
             else:
                 moving.add(name)
-            if kind == "floating" or (kind == "fixed" and parent == "world" and child in placed):
+            if kind == "floating" or (kind == "fixed" and is_placed):
                 root.remove(joint)
-            if kind == "floating" and not (parent == "world" and child in placed):
+            if kind == "floating" and not is_placed:
                 origin = joint.find("origin")
                 own = {"name": f"{name}_origin", "link": parent, "xyz": "0 0 0", "rpy": "0 0 0"}
                 SubElement(root, "frame", own | ({} if origin is None else origin.attrib))
-                self.floating.append((model, name, child, own["name"]))
+                self._float(model, name, child, own["name"])
             self._follow(model, joint, "mimic")
             still |= {name} if kind in _OF_MANY_AXES else set()
             for limit in joint.iterfind("limit[@effort]"):
                 effort = number_in(limit.get("effort", "")) or 0.0
                 if effort > 0.0:
-                    self.joints["effort"][model, name] = effort
+                    self.joints[model, name]["effort"] = effort
                 else:  # Many authors write 0 for an unknown limit.
                     still.add(name)
         count = Counter[str]()
@@ -270,51 +294,110 @@ class Mender:
                 count[name] += 1
                 actuator.set("name", f"{name}_{count[name]}" if count[name] > 1 else name)
 
-    # SDFormat.
-
-    def _mend_axes(self, joint: Element, place: str) -> None:
-        """Refuses two dampings, of which Drake reads one; writes the pitch of a screw in m."""
-        axes = (part for part in joint if part.tag in ("axis", "axis2"))
-        dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
-        if len({*map(number_in, dampings)}) > 1:
-            self.lose("axis2/damping", f"{place}: {' and '.join(dampings)}")
-        pitch = joint.find("thread_pitch")
-        if pitch is not None:  # In rad/m, of a thread that turns left.
-            joint.remove(pitch)
-            number = number_in(pitch.text or "")
-            if number == 0.0:
-                raise ModelError(f"{place}: with thread_pitch 0 it is no screw; mend the file")
-            if number is not None and joint.find("screw_thread_pitch") is None:
-                SubElement(joint, "screw_thread_pitch").text = repr(-2.0 * np.pi / number)
-
-    def _mend_sdf(
-        self,
-        root: Element,
-        file: Path,
-        model: str,
-        placed: Collection[str],
-        within: tuple[Path, ...],
-    ) -> None:
+    def _mend_sdf(self, root: Element, file: Path, model: str) -> None:
         for uri in root.iterfind(".//include/uri"):
             path = self.files.find((uri.text or "").strip(), file)
             if path is not None and path.is_dir():
                 path = next(iter(sorted(path.glob("*.sdf"))), None)
             if path is not None and path.is_file():
-                uri.text = self.copy(path, model, (), within).resolve().as_uri()
+                uri.text = self.copy(path, model).resolve().as_uri()
         for number, body in enumerate(root.iter("model")):
             body.attrib.setdefault("name", file.stem + f"_{number}" * bool(number))
             for link in body.iterfind("link") if self.has_geometry else ():
                 self._mend_shapes(link, file, model)
             for joint in body.findall("joint"):
                 parent, child = (joint.findtext(end, "").strip() for end in ("parent", "child"))
-                if parent == "world" and joint.get("type") == "fixed" and child in placed:
+                if parent == "world" and joint.get("type") == "fixed" and child in self.placed:
                     body.remove(joint)
-                self.joints["parent"][model, joint.get("name", "")] = parent
+                self.joints[model, joint.get("name", "")]["parent"] = parent
                 self._follow(model, joint, "drake:mimic")
+        for joint in root.iter("joint"):
+            # Drake reads one of two dampings.
+            axes = (part for part in joint if part.tag in ("axis", "axis2"))
+            dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
+            if len({*map(number_in, dampings)}) > 1:
+                self.lose("axis2/damping", f"{place_of(joint)}: {' and '.join(dampings)}")
+            pitch = joint.find("thread_pitch")
+            if pitch is not None:  # In rad/m, of a thread that turns left.
+                joint.remove(pitch)
+                radians = number_in(pitch.text or "")
+                if radians == 0.0:
+                    text = "with thread_pitch 0 it is no screw; mend the file"
+                    raise ModelError(f"{place_of(joint)}: {text}")
+                if radians is not None and joint.find("screw_thread_pitch") is None:
+                    SubElement(joint, "screw_thread_pitch").text = repr(-2.0 * np.pi / radians)
 
-    # MJCF, which says all where it means it.
+    # MJCF: each element of the copy says all that it means, where it means it.
 
-    def _mend_mjcf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
+    def _expand(self, root: Element, file: Path) -> None:
+        """Puts included files and defaults of classes into their places, and mends what is there.
+
+        Inactive equalities go. Servos become motors, since controls are efforts here, and the
+        limits of motors those of the efforts at joints, the gear times those of motors. Bodies of
+        mass 0, which MuJoCo takes if they do not move or move with others, lose their inertia, and
+        their geometry its mass.
+        """
+        self._include(root, file, count(1))
+        root.attrib.setdefault("model", file.stem)
+        _apply_defaults(root)
+        options = _compiler(root)
+        if options.get("coordinate") == "global":
+            way = "MuJoCo up to 2.3.2 reads it, and saves it with local ones"
+            raise ModelError(f"'{file.name}' has global coordinates; {way}")
+        for equality in root.iterfind("equality"):
+            for constraint in list(equality):
+                if constraint.attrib.pop("active", "true") == "false":
+                    equality.remove(constraint)
+        for joint in root.iter("joint"):  # MuJoCo takes an empty range for none.
+            words = joint.get("range", "").split()
+            if joint.get("limited", "auto" if any(map(number_in, words)) else "false") == "false":
+                joint.attrib.pop("range", None)
+        for motor in root.iterfind("actuator/*"):
+            law = motor.attrib.keys() & _OF_GENERAL if motor.tag == "general" else set()
+            own, gain = {key: motor.attrib.pop(key) for key in law}, 1.0
+            if motor.tag == "general" and {own.get(k, "") for k in _LAW} <= {"", "none", "fixed"}:
+                motor.tag = "motor"  # Of a control in another unit.
+                gain = abs(_first(own.get("gainprm", "")))
+            elif motor.tag in _SERVOS:  # Its control is no effort, and neither are its limits.
+                motor.tag = "motor"
+                text = "servos become motors without their gains: controls are efforts"
+                self.tell(text, f"'{motor.get('name', motor.get('joint', ''))}'")
+                motor.attrib.pop("ctrlrange", None)
+                motor.attrib.pop("ctrllimited", None)
+            gear = abs(_first(motor.get("gear", "")))
+            for key, scale in (("ctrlrange", gain * gear), ("forcerange", gear)):
+                bounds = [number_in(word) for word in motor.get(key, "").split()]
+                if scale != 1.0 and bounds and None not in bounds:
+                    motor.set(key, " ".join(repr(scale * (bound or 0.0)) for bound in bounds))
+        for body in root.iter("body") if options.get("inertiafromgeom") != "true" else ():
+            inertial = body.find("inertial")
+            if inertial is not None and number_in(inertial.get("mass", "")) == 0.0:
+                body.remove(inertial)
+                for geom in body.iterfind("geom"):
+                    geom.set("mass", "0")
+        for geom in root.iter("geom"):
+            if _collides(geom):
+                geom.attrib.pop("contype", None)
+                geom.attrib.pop("conaffinity", None)
+            if "friction" in geom.attrib:  # Drake has none that resists turning.
+                geom.set("friction", "".join(geom.get("friction", "").split()[:1]))
+
+    def _include(self, owner: Element, main: Path, number: Iterator[int]) -> None:
+        for index, node in reversed(list(enumerate(owner))):
+            if node.tag != "include":
+                self._include(node, main, number)
+                continue
+            if next(number) > _MOST_INCLUDED:
+                raise ModelError(f"'{main.name}' includes more than {_MOST_INCLUDED} files")
+            file = main.parent / node.get("file", "")
+            with self.files.within(file):
+                included = read_xml(file)
+                self._include(included, main, number)
+            for part in included.iter():
+                part.line = 0  # type: ignore[attr-defined]
+            owner[index : index + 1] = list(included)
+
+    def _mend_mjcf(self, root: Element, file: Path, model: str) -> None:
         self._mend_geoms(root, file, model)
         if not self.has_geometry:
             _remove(root, "contact")
@@ -324,20 +407,24 @@ class Mender:
             for motor in owner.findall("motor"):
                 if (kind := kinds.get(motor.get("joint", ""))) in _OF_MANY_AXES:
                     owner.remove(motor)
-                    name = motor.get("name", motor.get("joint"))
-                    self.lose(f"{kind}/motor", f"{file.name}: motor '{name}'")
+                    self.lose(f"{kind}/motor", place_of(motor))
         for joint in root.iter("joint"):
             name, armature = joint.get("name", ""), number_in(joint.get("armature", ""))
             if armature and name and joint.get("type", "hinge") in ("hinge", "slide"):
-                self.joints["armature"][model, name] = armature
+                self.joints[model, name]["armature"] = armature
             elif armature:
-                self.lose(mjcf.ARMATURE, f"{file.name}: of a joint that no motor can drive")
-        for name, free in mjcf.floating_bodies(root, placed):
-            self.floating.append((model, free, name, "world"))
+                self.lose(ARMATURE, f"{place_of(joint)}, which no motor can drive")
+        for body in root.iterfind("worldbody/body"):
+            name = body.get("name", "")
+            free = [*body.iterfind("freejoint"), *body.iterfind("joint[@type='free']")]
+            if free and name not in self.placed:
+                self._float(model, free[0].get("name", name), name, "world")
+            elif name in self.placed and not free and body.find("joint") is None:
+                SubElement(body, "freejoint")  # Else Drake welds it.
 
     def _mend_geoms(self, root: Element, file: Path, model: str) -> None:
         """Leaves out what of the geometry Drake cannot take, unless a body has its mass from it."""
-        options = mjcf.compiler(root)
+        options = _compiler(root)
         folder = file.resolve().parent / options.get("meshdir", options.get("assetdir", ""))
         meshes, used, shells = dict[str, Element](), dict[str, str](), set[str]()
         for asset in root.iterfind("asset/mesh"):
@@ -346,19 +433,22 @@ class Mender:
                 meshes[asset.get("name", "")] = asset
             if asset.attrib.pop("inertia", "") == "shell":
                 shells.add(asset.get("name", ""))
-        colliding = {geom.get("mesh") for geom in root.iter("geom") if mjcf.collides(geom)}
-        for geom, body, moves in mjcf.geoms(root):
-            name, mesh, fault = body.get("name", ""), geom.get("mesh", ""), mjcf.fault(geom)
-            weighs = moves and number_in(geom.get("mass", "1")) != 0.0
-            weighs &= mjcf.weighs_by_geometry(root) or body.find("inertial") is None
-            is_seen = self.has_geometry and (self.drawn or mjcf.collides(geom))
+        hulls = {geom.get("mesh") for geom in root.iter("geom") if _collides(geom)}
+        moved = [body for body in root.iter("body") if {"joint", "freejoint"} & _tags(body)]
+        moving = {geom for body in moved for geom in body.iter("geom")}
+        bodies = [*root.iterfind("worldbody"), *root.iter("body")]
+        for body, geom in [(owner, geom) for owner in bodies for geom in owner.findall("geom")]:
+            name, mesh, fault = body.get("name", ""), geom.get("mesh", ""), _fault_of_geom(geom)
+            weighs = geom in moving and number_in(geom.get("mass", "1")) != 0.0
+            weighs &= options.get("inertiafromgeom") == "true" or body.find("inertial") is None
+            is_seen = self.has_geometry and (self.drawn or _collides(geom))
             if mesh in meshes and mesh not in used and (weighs or is_seen):
                 own = meshes[mesh].get("file", "")
-                is_hull = self.has_geometry and mesh in colliding
+                is_hull = self.has_geometry and mesh in hulls
                 used[mesh] = self._mesh(own, folder / own, is_hull, (".obj",))
                 meshes[mesh].set("file", used[mesh])
             is_refused = mesh in used and not used[mesh]
-            why = "" if fault == mjcf.EMPTY and "mass" not in geom.attrib else fault
+            why = "" if fault == _EMPTY and "mass" not in geom.attrib else fault
             if is_refused or mesh in shells:
                 why = (
                     f"is the mesh '{mesh}', which Drake cannot read, or not as a shell (trimesh "
@@ -379,19 +469,84 @@ class Mender:
                     owner.remove(asset)
 
 
+def _apply_defaults(root: Element) -> None:
+    """Writes the defaults of its classes into each element of an MJCF file."""
+    classes: dict[str, dict[str, dict[str, str]]] = {}
+
+    def collect(default: Element, inherited: Mapping[str, dict[str, str]], name: str) -> None:
+        own = dict(inherited)
+        for node in default:
+            tags = (tag for tag, names in _ONE_DEFAULT.items() if node.tag in names)
+            tag = next(tags, node.tag)
+            own[tag] = own.get(tag, {}) | node.attrib
+        classes[default.get("class", name)] = own
+        for child in default.iterfind("default"):
+            collect(child, own, "")
+
+    def apply(owner: Element, inherited: str) -> None:
+        for node in owner:
+            tag = owner.tag if owner.tag in _ONE_DEFAULT else node.tag
+            known = classes.get(node.attrib.pop("class", inherited), {})
+            values = {} if node.tag in _ONE_DEFAULT else known.get(tag, {})
+            if owner.tag == "actuator" and node.tag != "general":
+                values = {key: value for key, value in values.items() if key not in _OF_GENERAL}
+            if _TURNS & node.attrib.keys():
+                values = {key: value for key, value in values.items() if key not in _TURNS}
+            node.attrib.update({**values, **node.attrib})
+            apply(node, node.get("childclass", inherited))
+
+    for default in root.findall("default"):
+        collect(default, classes.get("main", {}), "main")
+        root.remove(default)
+    apply(root, "main")
+
+
+def _compiler(root: Element) -> dict[str, str]:
+    """The options of MuJoCo's compiler."""
+    return {key: value for one in root.iterfind("compiler") for key, value in one.items()}
+
+
+def _first(words: str) -> float:
+    """The first number, and 1 if there is none, or 0."""
+    return number_in([*words.split(), "1"][0]) or 1.0
+
+
+def _tags(owner: Element) -> set[str]:
+    return {part.tag for part in owner}
+
+
+def _collides(geom: Element) -> bool:
+    """Whether a geometry of MJCF collides, and is not only drawn."""
+    return {geom.get("contype", "1"), geom.get("conaffinity", "1")} != {"0"}
+
+
+def _fault_of_geom(geom: Element) -> str:
+    """Why Drake takes no such shape of MJCF; "" if it does, or if it is a mesh."""
+    kind = "mesh" if "mesh" in geom.attrib else geom.get("type", "sphere")
+    if kind in ("mesh", "plane"):
+        return ""
+    if kind not in _SIZES:
+        return _UNREAD
+    sizes = [number_in(word) or 0.0 for word in geom.get("size", "").split()]
+    ends = geom.get("fromto", "").split()
+    count = 1 if ends else sum(_SIZES[kind].values()) or 3
+    is_empty = len(sizes) < count or min(sizes[:count]) <= 0.0
+    return _EMPTY if is_empty or (ends and ends[:3] == ends[3:]) else ""
+
+
 def _fault(form: Element, kind: str) -> str:
     """Why Drake takes no such shape of URDF or SDFormat; "" if it does."""
     sizes = _SIZES.get(form.tag.removeprefix("drake:"))
     if sizes is None and not (kind == ".sdf" and form.tag in ("plane", "empty")):
-        return mjcf.UNREAD
+        return _UNREAD
     for key in ("size", "radius", "length", "radii", "a", "b", "c", "scale"):
         words = (form.get(key) or form.findtext(key) or "").split()
         count = (sizes or {}).get(key, len(words))
         if len(words) != count and (words or kind == ".urdf"):
-            return mjcf.UNREAD
+            return _UNREAD
         numbers = [number_in(word) or 0.0 for word in words]
         if any(abs(number) <= _FLAT if key == "scale" else number <= 0.0 for number in numbers):
-            return mjcf.EMPTY
+            return _EMPTY
     return ""
 
 
@@ -407,7 +562,7 @@ def _has_hull(mesh: str, changed: int) -> bool:
 
 def _remove(owner: Element, tag: str) -> int:
     """Removes the children of a tag; returns how many there were."""
-    children = [child for child in owner if child.tag == tag]
+    children = owner.findall(tag)
     for child in children:
         owner.remove(child)
     return len(children)
@@ -431,10 +586,10 @@ def nearest_inertia(inertia: FloatArray) -> FloatArray:
     return np.asarray((axes * (second.sum() - second)) @ axes.T)
 
 
-def _mend_inertia(inertial: Element, kind: str, place: str) -> str:
+def _mend_inertia(inertial: Element, kind: str) -> str:
     """Replaces an impossible inertia by the nearest possible one; says what it replaced, or ""."""
-    words = _mass_and_entries(inertial, kind)
-    numbers = [number_in(word) for word in words]
+    words, matrix, place = _mass_and_entries(inertial, kind), inertial.find("inertia"), ""
+    numbers, place = [number_in(word) for word in words], place_of(inertial)
     if None in numbers:
         raise ModelError(f"{place}: mass and inertia are numbers, got {', '.join(words)}")
     if len(numbers) != 7:
@@ -457,8 +612,8 @@ def _mend_inertia(inertial: Element, kind: str, place: str) -> str:
             f"{place}: the moments of inertia are {before} kg m^2, and near these is none that a "
             f"body of {mass:g} kg can have; mend them"
         )
-    written = [repr(float(entry)) for entry in nearest[_ROWS, _COLUMNS]]
-    if (matrix := inertial.find("inertia")) is None:
+    written = [repr(entry) for entry in nearest[_ROWS, _COLUMNS].tolist()]
+    if matrix is None:
         # A fullinertia cannot be combined with a quat, so a diagonal one remains diagonal.
         key = "fullinertia" if "fullinertia" in inertial.attrib else "diaginertia"
         inertial.set(key, " ".join(written[: 6 if key == "fullinertia" else 3]))

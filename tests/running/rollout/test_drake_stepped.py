@@ -11,7 +11,7 @@ from drake_dae.running import export_loop, start_values
 from drake_dae.running import rollout as rollouts
 from drake_dae.running.merged_run import MergedRun
 from drake_dae.running.rollout_program import program_of
-from drake_dae.scenario.rolled import roll_scenario, rollout_times
+from drake_dae.scenario.build import roll_scenario, rollout_times
 
 STIFF = "plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, radius: 1.0e-5}"
 CONTINUOUS = (

@@ -18,7 +18,7 @@ from drake_dae.references.splines import UNROLLED
 from drake_dae.running import start_values
 from drake_dae.running.rollout import run_loop
 from drake_dae.running.rollout_program import program_of
-from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.build import roll_scenario
 
 SAMPLED = "sampling={period: 0.03125}"
 

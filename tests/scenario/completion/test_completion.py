@@ -21,9 +21,9 @@ from drake_dae.errors import ScenarioError
 from drake_dae.robots import Touch
 from drake_dae.scenario import complete_scenario
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.parts import Start, TiltFromNormalForm
+from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Postures, tool_axis
-from drake_dae.scenario.scenario import save_scenario
+from drake_dae.scenario.scenario import TiltFromNormalForm, save_scenario
 
 # tool.z = 0.35 m on the wall at 1.2 m, by the law of cosines with two links of 1 m.
 REACH = np.hypot(1.2, 0.35)

@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.form import Family, Key, Reader, keys_of
-from drake_dae.scenario.typed_yaml import dump_yaml, load_lines, load_yaml
+from drake_dae.scenario.form import Family, Key, Reader, dump_yaml, keys_of, load_lines, load_yaml
 
 
 class Surface:

@@ -16,10 +16,9 @@ from pydrake.multibody.tree import FrameIndex
 from pydrake.solvers import MathematicalProgram
 
 from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning
-from drake_dae.scenario.robot_file.read_by_drake import READ_BY_DRAKE
+from drake_dae.scenario.robot_file.read_by_drake import READ_BY_DRAKE, read_xml, write_xml
 from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.robot_file.xml_tree import read_xml, write_xml
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::drake_dae.errors.RobotFileWarning"),
@@ -48,10 +47,10 @@ URDF = f"""<robot name="r" xmlns:drake="http://drake.mit.edu">
 {JOINT.format("l", "continuous", "c", "d", "")}
 <transmission><type>SimpleTransmission</type><joint name="j"/><actuator name="m">
 <drake:rotor_inertia value="0.1"/><drake:gear_ratio value="3"/></actuator></transmission>
-<frame name="tip" link="a" xyz="1 0 0"/>
-<drake:ball_constraint><drake:ball_constraint_body_A name="a"/><drake:ball_constraint_body_B
-name="c"/><drake:ball_constraint_p_AP value="0 0 1"/><drake:ball_constraint_p_BQ value="0 0 1"/>
-</drake:ball_constraint></robot>"""
+<frame name="tip" link="a" xyz="1 0 0"/></robot>"""
+BALL = """<drake:ball_constraint><drake:ball_constraint_body_A name="a"/>
+<drake:ball_constraint_body_B name="c"/><drake:ball_constraint_p_AP value="0 0 1"/>
+<drake:ball_constraint_p_BQ value="0 0 1"/></drake:ball_constraint>"""
 SDF_INERTIAL = (
     "<inertial><pose>0.1 0.2 0.3 0.1 0.2 0.3</pose><mass>2</mass><inertia><ixx>0.3</ixx>"
     "<iyy>0.4</iyy><izz>0.5</izz><ixy>0.01</ixy><ixz>0.02</ixz><iyz>0.03</iyz></inertia></inertial>"
@@ -92,8 +91,7 @@ fullinertia="0.3 0.4 0.5 0.01 0.02 0.03"/><joint name="k" type="slide" axis="0 0
 <geom type="capsule" fromto="0 0 0 1 0 0" size="0.1" density="100"/><joint name="l"/>
 <body name="d" zaxis="1 0 1"><freejoint/><geom size="0.1"/></body></body></body></body></worldbody>
 <actuator><motor name="m" joint="j" gear="2" ctrlrange="-3 3" forcerange="-4 4"/>
-<motor name="n" joint="k" forcerange="-4 4"/></actuator>
-<equality><connect body1="a" body2="c" anchor="0 0 1"/></equality></mujoco>""".replace(
+<motor name="n" joint="k" forcerange="-4 4"/></actuator><equality/></mujoco>""".replace(
     '<body name="d" zaxis="1 0 1"><freejoint/>', '<body name="d" zaxis="1 0 1"><joint name="f"/>'
 )
 WHOLE = {".urdf": URDF, ".sdf": SDF, ".xml": MJCF}
@@ -184,6 +182,7 @@ LOST = {
         ("robot/loop", "</robot>", '<loop name="x"/>'),
         ("robot/constraint", "</robot>", '<constraint name="x"/>'),
         ("robot/loop_joint", "</robot>", '<loop_joint name="x"/>'),
+        ("robot/drake:ball_constraint", "</robot>", BALL),
         ("gazebo/joint", "</robot>", '<gazebo><joint name="x"/></gazebo>'),
         (
             "gazebo/turnGravityOff",
@@ -229,8 +228,13 @@ LOST = {
         ("body/gravcomp", '<body name="b"', ' gravcomp="1"'),
         ("body/frame", "</body>", "<frame><body/></frame>"),
         ("mujoco/tendon", "</mujoco>", '<tendon><fixed name="t"/></tendon>'),
-        ("equality/joint", "</equality>", '<joint joint1="j" joint2="k"/>'),
-        ("equality/weld", "</equality>", '<weld body1="a" body2="c"/>'),
+        ("equality/joint", "<equality/>", '<equality><joint joint1="j" joint2="k"/></equality>'),
+        ("equality/weld", "<equality/>", '<equality><weld body1="a" body2="c"/></equality>'),
+        (
+            "equality/connect",
+            "<equality/>",
+            '<equality><connect body1="a" body2="c" anchor="0 0 1"/></equality>',
+        ),
         ("option/density", "<option", ' density="1000"'),
         ("flag/gravity", "</mujoco>", '<option><flag gravity="disable"/></option>'),
         ("actuator/muscle", "</actuator>", '<muscle joint="k"/>'),
@@ -242,6 +246,7 @@ LOST = {
     ],
 }
 READ_IN_PART = "motor/forcerange", "joint/armature", "ball/motor"
+READ_IN_PART += "equality/connect", "robot/drake:ball_constraint"  # No equation of ours has them.
 
 
 @pytest.mark.parametrize(
@@ -284,7 +289,7 @@ HARMLESS = {
             "</mujoco>",
             '<default><joint stiffness="0"/></default><sensor/><worldbody><light/></worldbody>',
         ),
-        ("</equality>", '<joint joint1="j" joint2="k" active="false"/>'),
+        ("<equality/>", '<equality><joint joint1="j" joint2="k" active="false"/></equality>'),
         ("</mujoco>", '<default><equality solref="0.1 1"/></default>'),
         ('<joint name="l"', ' range="0 0"'),
     ],
@@ -310,12 +315,7 @@ MASSES = {
     ".sdf": "<inertial><mass>2</mass></inertial>",
     ".xml": '<inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/>',
 }
-OF_DRAKE = {
-    "ball": "",
-    "universal": "",
-    "screw": '<drake:screw_thread_pitch value="0.1"/>',
-    "curvilinear": '<drake:curves><drake:line_segment length="3"/></drake:curves>',
-}
+OF_DRAKE = {"ball": "", "universal": "", "screw": '<drake:screw_thread_pitch value="0.1"/>'}
 
 
 def one_joint(kind: str, form: str, limit: str = "", dynamics: str = "", rest: str = "") -> str:
@@ -338,7 +338,7 @@ def one_joint(kind: str, form: str, limit: str = "", dynamics: str = "", rest: s
 
 
 FORMS = {
-    ".urdf": "revolute prismatic planar floating ball universal screw curvilinear",
+    ".urdf": "revolute prismatic planar floating ball universal screw",
     ".sdf": "revolute prismatic ball universal screw",
     ".xml": "hinge slide ball free",
 }

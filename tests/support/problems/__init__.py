@@ -11,20 +11,19 @@ from problems.closed_loop import closed_loop_outputs, integrated, reference_at, 
 from problems.hidden import Hidden, hidden_normal_form
 from problems.made_up import (
     bead,
+    changed,
     double_integrator,
     early_control,
     held_point,
+    in_other_units,
     linear,
     mixed_degrees,
     redundant,
-    scalar,
     system_of,
     third_order,
 )
 from problems.mechanisms import (
     aircraft,
-    cart,
-    flexible_pendulum,
     gantry,
     hanging_pendulum,
     pendulum,
@@ -32,10 +31,9 @@ from problems.mechanisms import (
     pendulum_tension,
     two_link_arm,
 )
-from problems.networks import circuit, dc_motor, swing_network
+from problems.networks import circuit, swing_network
 from problems.nonholonomic import knife_edge, knife_edge_force, rolling_disk
 from problems.problem import Array, Known, Problem, known, unconstrained
-from problems.variants import changed, in_other_units
 
 __all__ = [
     "PROBLEMS",
@@ -75,16 +73,12 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
         linear,
         third_order,
         mixed_degrees,
-        cart,
-        flexible_pendulum,
         knife_edge,
         knife_edge_force,
         rolling_disk,
         swing_network,
         aircraft,
-        dc_motor,
         gantry,
-        scalar,
         held_point,
     )
 }

@@ -1,12 +1,13 @@
-"""Systems made up for what no machine at hand shows."""
+"""Systems made up for what no machine at hand shows, and others changed or in other units."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.dae import DaeSystem
-from problems.problem import Array, Known, Problem, known, unconstrained
+from problems.problem import Array, Known, Problem, known
 
 
 def linear() -> Problem:
@@ -147,24 +148,6 @@ def mixed_degrees() -> Problem:
     )
 
 
-def scalar() -> Problem:
-    """n = 1, m = 0: x' = -x^3 + u, z = x, mu = 1. All matrices are 1 x 1."""
-    system = DaeSystem.from_functions(
-        1, f=lambda x: -(x[0] ** 3), h=lambda x: 2, l=lambda x: x, name="scalar"
-    )
-    return Problem(
-        system=system,
-        constraint_degrees=(),
-        output_degrees=(1,),
-        index=0,
-        zero_dynamics=0,
-        output_order=(0,),
-        known=lambda x: unconstrained(1, -(x[0] ** 3), 2),
-        consistent=lambda random: random.standard_normal(1),
-        reference=[(0.0, 0.0, 1.0)],
-    )
-
-
 def held_point() -> Problem:
     """n = m = p = 1: x' = -x + 3 v + u is held at x = 2, so N* is a point.
 
@@ -247,4 +230,58 @@ def bead() -> DaeSystem:
         l=lambda x: [0.0],
         m=lambda x: [[1.0]],
         nominal_state=[1.0, 0.5],
+    )
+
+
+TABLE = [(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]
+
+
+def plate(rows, **fields):
+    """A plate (z, a, b) on legs at the corners r: heights z + a r_x + b r_y = 0, forces by J^T."""
+    jacobian = np.array([[1.0, x, y] for x, y in rows])
+    mass = np.diag([4.0, 0.5, 0.25])
+    q, v, names = slice(0, 3), slice(3, 6), [f"leg{i}" for i in range(len(rows))]
+    return DaeSystem.from_functions(
+        ["z", "a", "b", "vz", "va", "vb", "s"],
+        f=lambda x: ca.vertcat(x[v], -9.81 * 4.0, 0.3, -0.2, 0),
+        g=lambda x: ca.vertcat(ca.SX(3, len(rows)), jacobian.T, ca.SX(1, len(rows))),
+        h=lambda x: ca.vertcat(ca.SX(6, 1), 1),
+        k=lambda x: ca.mtimes(ca.SX(jacobian), x[q]),
+        l=lambda x: [x[6]],
+        m=lambda x: ca.SX(1, len(rows)),
+        mass_matrix=np.block(
+            [
+                [np.eye(3), np.zeros((3, 4))],
+                [np.zeros((3, 3)), mass, np.zeros((3, 1))],
+                [np.zeros((1, 6)), np.ones((1, 1))],
+            ]
+        ),
+        constraint_output_signals=names,
+        **fields,
+    )
+
+
+def changed(system: DaeSystem, **fields) -> DaeSystem:
+    """The system with other expressions or labels."""
+    return replace(system, **fields)
+
+
+def in_other_units(system: DaeSystem, state, force, control, constraint, output) -> DaeSystem:
+    """The same system with x, v, u, y, z measured in other units: factors per entry."""
+    x = ca.SX.sym("x", system.num_states)
+
+    def moved(expression: ca.SX) -> ca.SX:
+        return ca.substitute(expression, system.state, state * x)
+
+    return replace(
+        system,
+        state=x,
+        f=moved(system.f) / state,
+        g=ca.mtimes(np.diag(1 / state), ca.mtimes(moved(system.g), np.diag(force))),
+        h=ca.mtimes(np.diag(1 / state), ca.mtimes(moved(system.h), np.diag(control))),
+        k=moved(system.k) / constraint,
+        l=moved(system.l) / output,
+        m=ca.mtimes(np.diag(1 / output), ca.mtimes(moved(system.m), np.diag(force))),
+        nominal_state=system.nominal_state / state,
+        state_scale=system.scale / state,
     )

@@ -232,69 +232,6 @@ def gantry() -> Problem:
     )
 
 
-def cart() -> Problem:
-    """m = 0: a cart x'' = (u - c x')/mass, plain feedback linearization with mu = 2."""
-    system = DaeSystem.from_functions(
-        ["position", "speed"],
-        f=lambda x, p: [x[1], -p.damping * x[1] / p.mass],
-        h=lambda x, p: [0.0, 1.0 / p.mass],
-        l=lambda x, p: x[0],
-        parameters={"mass": 4.0, "damping": 0.3},
-        name="cart",
-    )
-    return Problem(
-        system=system,
-        constraint_degrees=(),
-        output_degrees=(2,),
-        index=0,
-        zero_dynamics=0,
-        output_order=(0,),
-        known=lambda x: unconstrained(1, -0.3 * x[1] / 4.0, 1.0 / 4.0),
-        consistent=lambda random: random.standard_normal(2),
-        reference=[(0.0, 0.0, 1.0)],
-    )
-
-
-def flexible_pendulum() -> Problem:
-    """m = 0, mu = 4: a link behind a flexible joint (Spong, 1987; Isidori 1989, 4.10).
-
-    I q'' = -w sin q - K (q - t), J t'' = K (q - t) + u, z = q. Then
-    q^(4) = -(w (cos q q'' - sin q q'^2) + K (q'' - t''))/I, and B = K/(I J).
-    """
-    i, j, k, w = 0.5, 0.1, 20.0, 4.0
-    system = DaeSystem.from_functions(
-        ["q", "qd", "t", "td"],
-        f=lambda x: [
-            x[1],
-            (-w * ca.sin(x[0]) - k * (x[0] - x[2])) / i,
-            x[3],
-            k * (x[0] - x[2]) / j,
-        ],
-        h=lambda x: [0, 0, 0, 1 / j],
-        l=lambda x: x[0],
-        name="flexible pendulum",
-    )
-
-    def closed_form(x: Array) -> Known:
-        qdd = (-w * np.sin(x[0]) - k * (x[0] - x[2])) / i
-        tdd = k * (x[0] - x[2]) / j
-        fourth = -(w * (np.cos(x[0]) * qdd - np.sin(x[0]) * x[1] ** 2) + k * (qdd - tdd)) / i
-        return unconstrained(1, fourth, k / (i * j))
-
-    return Problem(
-        system=system,
-        constraint_degrees=(),
-        output_degrees=(4,),
-        index=0,
-        zero_dynamics=0,
-        output_order=(0,),
-        known=closed_form,
-        consistent=lambda random: random.uniform(-0.3, 0.3, 4),
-        reference=[(0.1, 0.0, 0.3)],
-        source="Spong, Journal of Dynamic Systems, Measurement, and Control 109(4), 1987: mu = 4",
-    )
-
-
 def aircraft() -> Problem:
     """A planar vertical takeoff aircraft whose roll jets also push sideways: e = 0.5.
 

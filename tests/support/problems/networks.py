@@ -1,10 +1,10 @@
-"""Circuits, power lines and a motor."""
+"""Circuits and power lines."""
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.dae import DaeSystem, Signal
-from problems.problem import Array, Known, Problem, known, unconstrained
+from problems.problem import Array, Known, Problem, known
 
 
 def circuit() -> Problem:
@@ -116,40 +116,5 @@ def swing_network() -> Problem:
         source="Hill and Mareels, IEEE Transactions on Circuits and Systems 37(11), 1990: index 1 "
         "where the power flow Jacobian is regular, so 2 with t' = v; network: Bergen and Hill, "
         "IEEE Transactions on Power Apparatus and Systems 100(1), 1981",
-        minimum_phase=True,
-    )
-
-
-def dc_motor() -> Problem:
-    """A motor controlled by its field: field and armature currents i, j and speed w.
-
-    i' = -a i + u, j' = -b j + c - d i w, w' = e i j, z = w. So w'' = e ((-a i + u) j + i j') and
-    B = e j: mu = 2 as long as j is not 0. At constant speed i = 0, and j' = -b j + c is left.
-    """
-    a, b, c, d, e = 1.2, 0.8, 1.6, 0.7, 1.5
-    system = DaeSystem.from_functions(
-        ["i", "j", "w"],
-        f=lambda x: [-a * x[0], -b * x[1] + c - d * x[0] * x[2], e * x[0] * x[1]],
-        h=lambda x: [1, 0, 0],
-        l=lambda x: x[2],
-        nominal_state=[0.0, 2.0, 1.0],
-        name="DC motor",
-    )
-
-    def closed_form(x: Array) -> Known:
-        armature = -b * x[1] + c - d * x[0] * x[2]
-        return unconstrained(1, e * (-a * x[0] * x[1] + x[0] * armature), e * x[1])
-
-    return Problem(
-        system=system,
-        constraint_degrees=(),
-        output_degrees=(2,),
-        index=0,
-        zero_dynamics=1,
-        output_order=(0,),
-        known=closed_form,
-        consistent=lambda random: np.array([0, 2, 1]) + random.uniform(-0.3, 0.3, 3),
-        reference=[(1.0, 0.0, 0.2)],
-        source="Khalil, Nonlinear Systems, 2002, chapter 13: the field-controlled DC motor",
         minimum_phase=True,
     )

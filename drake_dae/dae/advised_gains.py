@@ -1,0 +1,378 @@
+"""Gains of law, observer and estimator for compliant contact and given sensors, as an optimum."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from math import inf, prod
+
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import check_whole_number, positive
+from drake_dae.dae.contact_gains import ContactGains, best_damping
+from drake_dae.dae.one_direction import Direction, DirectionGains, SensorNoise, sampled_loop
+from drake_dae.errors import GainError, ModelError
+
+_PHASE = 0.3
+"""As for `contact_gains`: the loss of phase by sampling and delay at the crossover, in rad; half of
+it with an estimator: a force along the contact that it attributes to friction couples the contact
+to free directions, and with the full phase an unknown mass of 1 kg made them swing."""
+
+MASSES = (0.5, 1.0, 2.0)
+"""Free directions are stable if a force accelerates by these factors more than in the model."""
+
+CONTACT_MASSES = (2.0 / 3.0, 1.0, 1.5)
+STIFFNESSES = (1e-3, 0.1, 0.5, 1.0, 2.0)
+"""The same along a contact, each with these stiffnesses relative to the stated one."""
+
+DECAY = 0.05
+"""The least rate at which these loops settle, relative to w, with half of the stiffness or more."""
+
+SLOWER = (1.0, 0.5, 0.25)
+"""The factors by which the integral and the observer along a contact are slowed, since both reduce
+damping; the first one for which there are gains is taken."""
+
+MODEL_ERROR, EVERY = 1.0, 2.0
+"""An unknown force of 1 N appears or turns every 2 s."""
+
+RAMP = 10.0
+"""The reference of a force changes by 10 N/s."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class SensedContact:
+    """The numbers of a robot in contact, its sampling and its sensors that decide the gains.
+
+    `period` is T in s, `delay` that of the control in samples, `stiffness` k in N/m, `mobility`
+    J M^-1 J^T of the contact in 1/kg, the largest along the motion, and `free_mobility` that of the
+    points that follow a path. `lever` and `contact_lever` are the displacements of such a point and
+    of the contact per radian of noise of all joints, the lengths of rows of J, in m/rad; `inertia`
+    is sqrt(tr M M), the torque per acceleration of all joints, in kg m^2; `noise` that of a joint's
+    angle and velocity and of the force, with a `velocity_bandwidth` if velocities are filtered
+    differences; `estimates` tells whether the state comes from a `StateEstimator`.
+
+    Raises:
+        ModelError: A number is not positive, or a noise is negative.
+    """
+
+    period: float
+    delay: int
+    stiffness: float
+    mobility: float
+    free_mobility: float
+    lever: float
+    contact_lever: float
+    inertia: float
+    noise: SensorNoise
+    estimates: bool
+
+    def __post_init__(self) -> None:
+        names = ("period", "stiffness", "mobility", "free_mobility", "lever", "contact_lever")
+        for name in (*names, "inertia"):
+            positive(name, getattr(self, name))
+        check_whole_number("delay", self.delay, 0)
+        for name, value in vars(self.noise).items():
+            if not value >= 0.0:
+                raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
+
+    def free(self, mass_error: float = 1.0) -> Direction:
+        """A free direction."""
+        return Direction(self.period, self.delay, mass_error=mass_error)
+
+    def contact(self, mass_error: float = 1.0, share: float = 1.0) -> Direction:
+        """The direction of the contact, with a fraction of its stiffness."""
+        stiffness = share * self.stiffness
+        return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
+
+    def noise_of(self, lever: float) -> SensorNoise:
+        """The noise of a distance that is computed from noisy angles."""
+        position, velocity = lever * self.noise.position, lever * self.noise.velocity
+        return replace(self.noise, position=position, velocity=velocity)
+
+    @cached_property
+    def best_damping(self) -> float:
+        """`contact_damping` of the contact, in 1/s."""
+        return best_damping(self.stiffness, self.mobility, self.period, self.delay)
+
+
+@dataclass(frozen=True)
+class Part:
+    """The prediction for one direction: the error, its part by noise, and the roughness in N m."""
+
+    rate: float
+    rates: DirectionGains
+    is_contact: bool
+    error: float
+    by_noise: float
+    roughness: float
+
+    @classmethod
+    def of(cls, situation: SensedContact, w: float, rates: DirectionGains, contact: bool) -> "Part":
+        """Of the linear loop with these gains, which belong to the rate w in 1/s."""
+        direction = situation.contact() if contact else situation.free()
+        lever = situation.contact_lever if contact else situation.lever
+        mobility = situation.mobility if contact else situation.free_mobility
+        loop = sampled_loop(direction, rates, situation.noise_of(lever))
+        error, jump = loop.deviations()
+        step = MODEL_ERROR * mobility * loop.after_step() * (loop.period / EVERY) ** 0.5
+        if contact:
+            ramp = rates.gains[2] * RAMP / (mobility * situation.stiffness)
+            whole, roughness = float(np.linalg.norm([error, step, ramp])), lever * jump / mobility
+        else:
+            _, jump = sampled_loop(direction, rates, situation.noise_of(1.0)).deviations()
+            whole, roughness = float(np.hypot(error, step)), situation.inertia * jump
+        return cls(w, rates, contact, whole, error, roughness)
+
+
+def is_stable(situation: SensedContact, part: Part) -> bool:
+    """Whether a loop settles for all masses and stiffnesses for which it must be stable."""
+    quiet = SensorNoise(velocity_bandwidth=situation.noise.velocity_bandwidth)
+    cases = [(situation.free(mass), DECAY) for mass in MASSES]
+    if part.is_contact:
+        cases = [
+            (situation.contact(mass, share), DECAY if share >= 0.5 else 0.0)
+            for mass, share in product(CONTACT_MASSES, STIFFNESSES)
+        ]
+    return all(
+        loop.radius < 1.0 - decay * part.rate * loop.period
+        for direction, decay in cases
+        for loop in [sampled_loop(direction, part.rates, quiet)]
+    )
+
+
+def _free(situation: SensedContact, fast: float | None) -> list[Part]:
+    """The predictions for free directions with all rates, and that of an estimator, in 1/s."""
+    found = []
+    for w in _rates(situation):
+        p = 1.5 * w
+        rates = DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
+        found.append(Part.of(situation, w, rates, False))
+    return found
+
+
+def _along(situation: SensedContact, fast: float | None, share: float) -> list[Part]:
+    """The same along the contact, with a factor by which integral and observer are slowed."""
+    found = []
+    for w in _rates(situation):
+        c = min(2.3 * w, situation.best_damping)
+        rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
+        found.append(Part.of(situation, w, rates, True))
+    return found
+
+
+def noisiest_sensor(situation: SensedContact, part: Part, deviation: int) -> str:
+    """The sensor whose noise causes most of an error (deviation 0), or of a roughness (1)."""
+    direction = situation.contact() if part.is_contact else situation.free()
+    lever = situation.contact_lever if part.is_contact else situation.lever
+
+    def without(name: str) -> float:
+        quiet = replace(situation, noise=replace(situation.noise, **{name: 0.0}))
+        return sampled_loop(direction, part.rates, quiet.noise_of(lever)).deviations()[deviation]
+
+    return min(("position", "velocity", "force")[: 2 + part.is_contact], key=without)
+
+
+@dataclass(frozen=True)
+class AdvisedGains:
+    """Gains with the rate of the estimator in 1/s, if there is one, and what is predicted for them.
+
+    The errors are the rms ones of a point in m and of the contact force in N: by noise, by an
+    unknown force of `MODEL_ERROR` that appears every `EVERY` seconds and, of the force, by a
+    reference that changes by `RAMP`, in squares; `noise_error` and `noise_force` are their parts by
+    noise. The roughness is the rms change of the controls from sample to sample in N m.
+    """
+
+    gains: ContactGains
+    state_rate: float | None
+    position_error: float
+    force_error: float
+    noise_error: float
+    noise_force: float
+    roughness: float
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """The largest roughness in N m and errors in m and N."""
+
+    roughness: float
+    position_error: float
+    force_error: float
+
+    def order(self, pair: Sequence[Part]) -> tuple[float, float]:
+        """What is least for the best gains: the errors without a bound, then the roughness."""
+        bounds = self.position_error, self.force_error
+        errors = [part.error for part, most in zip(pair, bounds, strict=True) if most == inf]
+        return prod(errors), _roughness(pair)
+
+
+def _roughness(pair: Sequence[Part]) -> float:
+    """That of both directions, in N m."""
+    return float(np.hypot(pair[0].roughness, pair[1].roughness))
+
+
+@checked(ModelError)
+def advised_gains(
+    situation: SensedContact,
+    roughness: float,
+    *,
+    position_error: float = inf,
+    force_error: float = inf,
+) -> AdvisedGains:
+    """Returns the gains with the least predicted errors that are smooth and stable enough.
+
+    The gains are those of `contact_gains`, as functions of its rate w, for which free directions
+    and contacts have a value of their own; and the rate of a `StateEstimator`, if there is one.
+    For each of them the loop of one direction is a linear system with samples, delay, law,
+    observer and contact; its errors and its roughness follow from Lyapunov's equation, its
+    stability from eigenvalues; see `sampled_loop`. The product of the errors of position and force
+    is least among those gains that
+
+    - change the controls by at most `roughness` N m from sample to sample, in rms,
+    - are stable, and settle at least at the rate `DECAY` w, if a force accelerates 1/2 to 2 times
+      as in the model of the law in free directions, and 2/3 to 3/2 times along a contact whose
+      stiffness is up to 2 times the stated one,
+    - lose at most 0.3 rad of phase to samples and delay, with an estimator half of it.
+
+    Where an error in m or N is bounded, the gains of its direction are the smoothest ones within
+    the bound.
+
+    Raises:
+        GainError: No gains do so; the message names the noise or the limit that prevents it.
+        ModelError: The roughness or an error is not positive.
+    """
+    positive("roughness", roughness)
+    for name, most in (("position_error", position_error), ("force_error", force_error)):
+        if not most > 0.0:
+            raise ModelError(f"{name} must be positive, got {most:g}")
+    bounds = _Bounds(roughness, position_error, force_error)
+    tried = ((_pair(situation, fast, bounds), fast) for fast in _state_rates(situation))
+    candidates = [(*found, fast) for found, fast in tried if found is not None]
+    if not candidates:
+        raise GainError(_reason(situation, bounds))
+    free, contact, fast = min(candidates, key=lambda found: bounds.order(found[:2]))
+    w, of_contact = free.rate, contact.rates
+    return AdvisedGains(
+        gains=ContactGains(
+            position_rate=1.5 * w,
+            force_gain=of_contact.force_gain,
+            constraint_damping=of_contact.gains[2],
+            observer_rate=2.0 * w,
+            observer_force_rate=of_contact.observer_rate,
+            friction_rate=w / 2.0,
+        ),
+        state_rate=fast,
+        position_error=free.error,
+        force_error=contact.error,
+        noise_error=free.by_noise,
+        noise_force=contact.by_noise,
+        roughness=_roughness((free, contact)),
+    )
+
+
+def _rates(situation: SensedContact) -> list[float]:
+    """The rates w that are tried, from the largest one by the loss of phase on."""
+    phase = _PHASE / 2.0 if situation.estimates else _PHASE
+    highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
+    return np.geomspace(highest, highest / 60.0, 17).tolist()
+
+
+def _state_rates(situation: SensedContact) -> list[float | None]:
+    """The rates of an estimator that are tried."""
+    if not situation.estimates:
+        return [None]
+    rates = [share * _rates(situation)[0] for share in (2.0, 4.0, 7.0, 12.0, 20.0)]
+    return [rate for rate in rates if rate * situation.period <= 0.5]
+
+
+def _pair(
+    situation: SensedContact, fast: float | None, bounds: _Bounds
+) -> tuple[Part, Part] | None:
+    """The best gains of free directions and of the contact, if there are any."""
+
+    def free(allowed: float) -> Part | None:
+        return _best(situation, _free(situation, fast), allowed, bounds.position_error)
+
+    def contact(allowed: float) -> Part | None:
+        allowed = min(allowed, bounds.roughness / 2.0**0.5)
+        tried = (_along(situation, fast, share) for share in SLOWER)
+        best = (_best(situation, parts, allowed, bounds.force_error) for parts in tried)
+        return next(filter(None, best), None)
+
+    # The contact comes first, with at most its share of the roughness; but free directions do where
+    # their error is bounded, since their smoothest gains leave the most.
+    is_free_first = bounds.position_error < inf
+    first, second = (free, contact) if is_free_first else (contact, free)
+    if (one := first(bounds.roughness)) is None:
+        return None
+    if (other := second((bounds.roughness**2 - one.roughness**2) ** 0.5)) is None:
+        return None
+    return (one, other) if is_free_first else (other, one)
+
+
+def _best(situation: SensedContact, parts: list[Part], allowed: float, most: float) -> Part | None:
+    """The part with the least error that is smooth and stable enough, if there is one.
+
+    Where the error may be at most a number, it is the smoothest one within it.
+    """
+    within = [part for part in parts if part.roughness <= allowed and part.error <= most]
+    for part in sorted(within, key=lambda part: part.error if most == inf else part.roughness):
+        if is_stable(situation, part):
+            return part
+    return None
+
+
+def settles_along(situation: SensedContact) -> bool:
+    """Whether any gains are stable along the contact with a margin."""
+    tried = product(_state_rates(situation), SLOWER)
+    return any(is_stable(situation, part) for each in tried for part in _along(situation, *each))
+
+
+def _reason(situation: SensedContact, bounds: _Bounds) -> str:
+    """Why no gains are found."""
+    found = []  # The stable parts of free directions and of the contact, for each estimator.
+    for fast in _state_rates(situation):
+        along = [part for share in SLOWER for part in _along(situation, fast, share)]
+        tried = _free(situation, fast), along
+        found.append([[part for part in parts if is_stable(situation, part)] for parts in tried])
+    most_of = bounds.position_error, bounds.force_error
+    names = ("in free directions", "m"), ("along the contact", "N")
+    for parts, (where, unit), most in zip(zip(*found, strict=True), names, most_of, strict=True):
+        stable = [part for some in parts for part in some]
+        if not stable:
+            return (
+                f"no gains are stable {where} with a margin, for a contact of "
+                f"{situation.stiffness:.3g} N/m sampled each {situation.period:g} s with "
+                f"{situation.delay} samples of delay: sample more often, or make it softer"
+            )
+        best = min(stable, key=lambda part: part.error)
+        if best.error > most:
+            cause = f"an unknown force of {MODEL_ERROR:g} N that appears every {EVERY:g} s"
+            if best.by_noise > best.error / 2.0:
+                cause = f"the noise of the {noisiest_sensor(situation, best, 0)}"
+            return (
+                f"the error {where} is {best.error:.3g} {unit} rms with the best gains that are "
+                f"stable, mostly by {cause}, and {most:.3g} {unit} are allowed: allow more, sample "
+                "more often, or use better sensors"
+            )
+    smoothest = []
+    for both in found:  # Of one estimator.
+        bounded = zip(both, most_of, strict=True)
+        within = [[part for part in parts if part.error <= most] for parts, most in bounded]
+        if all(within):
+            smoothest.append([min(parts, key=lambda part: part.roughness) for parts in within])
+    if not smoothest:
+        return (
+            "no rate of the estimator has both errors within their bounds: allow more of one of "
+            "them, sample more often, or use better sensors"
+        )
+    across, into = min(smoothest, key=_roughness)
+    return (
+        f"the noise of the {noisiest_sensor(situation, across, 1)} changes the controls by "
+        f"{across.roughness:.3g} N m in free directions and {into.roughness:.3g} N m along the "
+        "contact from sample to sample with the smoothest gains that are stable and keep the "
+        f"errors; {bounds.roughness:.3g} N m are allowed, of which the contact has at most "
+        f"{bounds.roughness / 2.0**0.5:.3g}: allow more roughness, or use a better sensor"
+    )

@@ -1,0 +1,313 @@
+"""Contacts of balls with surfaces, and Drake's laws of point contact, as expressions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from drake_dae.errors import ModelError
+from drake_dae.robots import Constraint, RobotModel, Touch
+from drake_dae.systems.contact_material import PointMaterial
+from drake_dae.trace.expressions import as_constant, length_of
+from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
+
+ITERATIONS = 10
+"""The number of Newton steps for the velocities of contacts. A robot in contact needs 3 to 5. Among
+random problems far beyond those of robots (W over 2.5 decades, impulses over 6, sliding from 0.1 to
+1000 v_s), one contact in 1,000 and one pair in 200 need more."""
+
+SOLVED, AT_REST = 1e-9, 1e-6
+"""The allowed residual of these velocities, relative to them, or to AT_REST in m/s if less."""
+
+SOFT = 1e-3
+"""Drake's `sigma`: the speed scale of friction relative to the change of speed by an impulse."""
+
+TURNS = 4
+"""The number of iterations for the deepest point of a ball, if a distance is exact only on the
+surface: they reduce the error of its direction by (radius / radius of curvature)^4."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointContact:
+    """The contact of a ball with a surface halfway into their overlap, in the world."""
+
+    depth: ca.SX  # m, negative without contact
+    normal: ca.SX  # of the surface, toward the robot
+    jacobian: ca.SX  # of the velocity J(q) v of the robot at the point
+    velocity: ca.SX  # of the surface there
+    friction: ca.SX
+    viscous_friction: ca.SX  # N s/m
+    stiffness: ca.SX  # k, N/m
+    dissipation: ca.SX  # d of Hunt and Crossley, s/m
+    stiction_tolerance: float  # v_s, m/s
+
+
+def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
+    """The constraints of a robot with their contact points; refuses what is no such contact."""
+    if not model.constraints:
+        raise ModelError("the robot has no constraints, so there is nothing to touch")
+    contacts = []
+    for constraint in model.constraints:
+        touch = constraint.touch(model.links)
+        if touch is None:
+            raise ModelError(
+                f"'{constraint.name}' is no contact of a point with a surface, so it cannot be "
+                "compliant: take an ideal plant, or a PointOnSurface"
+            )
+        contacts.append((constraint, touch))
+    return contacts
+
+
+def ball_normals(model: RobotModel) -> ca.SX:
+    """The normals of the surfaces in the frames of their constraints, stacked, shape (3 k, 1).
+
+    A ball's center is the point of its constraint plus the radius times the nominal normal.
+    """
+    touches = [touch for _, touch in touching(model)]
+    return ca.vertcat(*(ca.mtimes(model.links.rotation(t.frame).T, t.normal) for t in touches))
+
+
+def point_contacts(
+    model: RobotModel, normals: ca.SX, numbers: ca.SX, material: PointMaterial
+) -> list[PointContact]:
+    """The contact of a robot's ball with the surface of each constraint.
+
+    `normals` are the `ball_normals` of the nominal configuration, `numbers` the material's values.
+    """
+    kinematics, links = model.links.kinematics(), model.links
+    stiffness, dissipation, friction, radius = ca.vertsplit(numbers)
+    contacts = []
+    for i, (constraint, touch) in enumerate(touching(model)):
+        point = ca.SX.sym("point", 3)
+        lever = point - kinematics.position(touch.frame, touch.point)
+        moving = kinematics.velocity(touch.frame, touch.point)
+        moving += ca.cross(kinematics.angular_velocity(touch.frame), lever)
+        jacobian = ca.jacobian(kinematics.value(moving), links.v)
+        velocity = kinematics.value(touch.velocity(point))
+        coefficients = {"friction": ca.SX(0), "viscous_friction": ca.SX(0)}
+        for parameter in constraint.parameters:
+            coefficients[parameter.name.removeprefix(f"{constraint.name}.")] = parameter.symbol
+        own = coefficients["friction"] if material.friction is None else friction
+        arm = ca.mtimes(links.rotation(touch.frame), radius * normals[3 * i : 3 * i + 3])
+        ball = links.position(touch.frame, touch.point) + arm
+        normal, depth = _overlap(touch, ball, radius)
+        contact = ball - normal * (radius - depth / 2)
+        moves, drags = ca.substitute([jacobian, velocity], [point], [contact])
+        resistance = own, coefficients["viscous_friction"]
+        spring = stiffness, dissipation, material.stiction_tolerance
+        contacts.append(PointContact(depth, normal, moves, drags, *resistance, *spring))
+    return contacts
+
+
+def _overlap(touch: Touch, ball: ca.SX, radius: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """The unit normal of the surface and the depth of a ball there, if need be by iteration."""
+    point = ca.SX.sym("point", 3)
+    clearance = touch.clearance(point)
+    slope = ca.gradient(clearance, point)
+    if touch.is_exact:
+        normal, gap = ca.substitute([slope, clearance], [point], [ball])
+        return normal, radius - gap
+    slope = slope / length_of(slope)
+    normal = ca.substitute(slope, point, ball)
+    for _ in range(TURNS):
+        normal = ca.substitute(slope, point, ball - radius * normal)
+    return normal, -ca.substitute(clearance, point, ball - radius * normal)
+
+
+def contact_force(contact: PointContact, v: ca.SX) -> ca.SX:
+    """The force on the robot of a continuous MultibodyPlant, in N, shape (3, 1):
+
+        f_n = k x max(0, 1 + d x'),    f_t = -mu f_n step5(|v_t| / v_s) v_t / |v_t| - c v_t,
+
+    with the depth x > 0 and step5(s) = s^3 (10 - 15 s + 6 s^2) up to s = 1, and 1 beyond. Viscous
+    friction c is not Drake's.
+    """
+    relative = ca.mtimes(contact.jacobian, v) - contact.velocity
+    approach, tolerance = -ca.dot(contact.normal, relative), contact.stiction_tolerance
+    sliding = relative + contact.normal * approach
+    damping = ca.fmax(0, 1 + contact.dissipation * approach)
+    push = contact.stiffness * contact.depth * damping
+    speed = ca.sqrt(ca.sumsqr(sliding))
+    s = speed / tolerance
+    slow = s**2 * (10 - 15 * s + 6 * s**2) / tolerance
+    slope = ca.if_else(s < 1, slow, 1 / ca.fmax(speed, tolerance))
+    traction = slope * sliding
+    along = -contact.friction * push * traction - contact.viscous_friction * sliding
+    return ca.if_else(contact.depth > 0, contact.normal * push + along, ca.SX(3, 1))
+
+
+def contact_step(
+    contacts: Sequence[PointContact], v: ca.SX, free: ca.SX, mass: ca.SX, h: float
+) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """The step of a discrete MultibodyPlant with Drake's default, the "lagged" approximation:
+
+        A (v_+ - v*) = J^T gamma(v_c),    v_c = J v_+ - v_surface,
+        gamma_n = h (k x - h k v_n)_+ (1 - d v_n)_+,    gamma_t = -mu gamma_0 v_t / |v_t|_s,
+
+    with |v_t|_s = sqrt(|v_t|^2 + e^2), e = max(v_s, sigma mu w gamma_0), and gamma_0 = h k x (1 - d
+    v_n0)_+ and x of the state before the step, for contacts with x > 0 there (Castro et al. 2024,
+    "Irrotational contact fields"). Drake's solver stops at a relative residual of 1e-6; this one
+    solves for v_c to round-off by a primal-dual Newton's method: since p = v_t / |v_t|_s are
+    separate unknowns, it also converges if the sliding direction turns (Chan, Golub and Mulet
+    1999). Velocities and impulses of a contact have the normal as their first axis. For n
+    velocities of joints it solves n equations if these are fewer than the 3 k of the contacts: with
+    the slope G of the impulses and W = J A^-1 J^T
+
+        (1 - W G)^-1 = 1 + J (A - J^T G J)^-1 J^T G.
+
+    Only the last step is differentiated, with the velocity before it and the matrix as
+    constants: by the implicit function theorem, first derivatives are then those of the solution,
+    at a third of the operations.
+
+    Returns v_+ from v before and v* = `free` after a step without contact; the mean forces of the
+    contacts on the robot in N; and a number that is negative where they were not found.
+    """
+    count = len(contacts)
+    axes = ca.diagcat(*(_axes(contact.normal) for contact in contacts))
+    jacobian = ca.mtimes(axes, ca.vertcat(*(contact.jacobian for contact in contacts)))
+    surface = ca.mtimes(axes, ca.vertcat(*(contact.velocity for contact in contacts)))
+    before = ca.mtimes(jacobian, v) - surface
+    target = ca.mtimes(jacobian, free) - surface
+    response = PositiveDefiniteFactorization(mass).solve(jacobian.T)
+    is_reduced = 3 * count > v.numel()
+    delassus = None if is_reduced else ca.mtimes(jacobian, response)
+    laws = [
+        _Lagged.of(contact, of_one, rows, mass, h)
+        for contact, of_one, rows in zip(contacts, _each(before), _each(jacobian), strict=True)
+    ]
+
+    def impulses(velocity: ca.SX) -> ca.SX:
+        return ca.vertcat(
+            *(law.impulse(own) for law, own in zip(laws, _each(velocity), strict=True))
+        )
+
+    def residual(velocity: ca.SX) -> ca.SX:
+        gamma = impulses(velocity)
+        if is_reduced:
+            return velocity - target - ca.mtimes(jacobian, ca.mtimes(response, gamma))
+        return velocity - target - ca.mtimes(delassus, gamma)
+
+    velocity = before
+    shares = [law.share(own) for law, own in zip(laws, _each(before), strict=True)]
+    for remaining in reversed(range(ITERATIONS)):
+        now = list(zip(laws, _each(velocity), shares, strict=True))
+        slope = ca.diagcat(*(law.slope(own, share) for law, own, share in now))
+        if is_reduced:
+            matrix = mass - ca.mtimes([jacobian.T, slope, jacobian])
+        else:
+            matrix = ca.SX.eye(3 * count) - ca.mtimes(delassus, slope)
+        if not remaining:
+            velocity, matrix, slope = map(as_constant, (velocity, matrix, slope))
+            now = list(zip(laws, _each(velocity), shares, strict=True))
+        change = -residual(velocity)
+        if is_reduced:
+            pushed = ca.mtimes([jacobian.T, slope, change])
+            change += ca.mtimes(jacobian, Factorization(matrix).solve(pushed))
+        else:
+            change = _solved(matrix, change)
+        shares = [
+            law.next_share(own, share, moved)
+            for (law, own, share), moved in zip(now, _each(change), strict=True)
+        ]
+        velocity += change
+    slack = SOLVED * ca.fmax(ca.norm_2(target), AT_REST) - ca.norm_2(residual(velocity))
+    impulse = impulses(velocity)
+    return free + ca.mtimes(response, impulse), ca.mtimes(axes.T, impulse) / h, slack
+
+
+def _each(stacked: ca.SX) -> list[ca.SX]:
+    """The three rows of each contact."""
+    parts: list[ca.SX] = ca.vertsplit(stacked, 3)
+    return parts
+
+
+def _axes(normal: ca.SX) -> ca.SX:
+    """Orthonormal axes as rows, the unit normal first, without a singular direction.
+
+    Duff et al., "Building an orthonormal basis, revisited", 2017.
+    """
+    x, y, z = ca.vertsplit(normal)
+    sign = ca.copysign(1, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = ca.horzcat(1 + sign * x**2 * a, sign * b, -sign * x)
+    return ca.sparsify(ca.vertcat(normal.T, first, ca.horzcat(b, sign + y**2 * a, -y)))
+
+
+def _solved(matrix: ca.SX, right: ca.SX) -> ca.SX:
+    """X of (1 - W G) X = B. For one contact by elimination: it has positive principal minors.
+
+    Since W is positive definite and G has the normal apart from the tangential directions, where
+    -G - G^T is positive semidefinite, no pivot is below 1 or, of the last two together, zero.
+    """
+    if matrix.shape != (3, 3):
+        return Factorization(matrix).solve(right)
+    first, *factors = ca.vertsplit(matrix[:, 0])
+    lower = matrix[1:, 1:] - ca.mtimes(ca.vertcat(*factors) / first, matrix[0, 1:])
+    rest = right[1:] - ca.vertcat(*factors) / first * right[0]
+    (a, c), (b, d) = (ca.vertsplit(lower[:, j]) for j in range(2))
+    last = ca.vertcat(d * rest[0] - b * rest[1], a * rest[1] - c * rest[0]) / (a * d - b * c)
+    return ca.vertcat((right[0] - ca.mtimes(matrix[0, 1:], last)) / first, last)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lagged:
+    """The impulse of one contact as a function of its velocity, in its axes."""
+
+    contact: PointContact
+    h: float
+    elastic: ca.SX  # k x before the step
+    lagged: ca.SX  # mu gamma_0
+    softness: ca.SX  # e
+
+    @classmethod
+    def of(
+        cls, contact: PointContact, before: ca.SX, jacobian: ca.SX, mass: ca.SX, h: float
+    ) -> "_Lagged":
+        """The impulse; its velocity before the step and J are in the contact's axes."""
+        elastic = contact.stiffness * ca.fmax(contact.depth, 0)
+        damping = ca.fmax(0, 1 - contact.dissipation * before[0])
+        lagged = contact.friction * h * elastic * damping
+        response = ca.mtimes(jacobian / ca.repmat(ca.diag(mass).T, 3, 1), jacobian.T)
+        softness = ca.fmax(contact.stiction_tolerance, SOFT * ca.norm_fro(response) / 3 * lagged)
+        return cls(contact, h, elastic, lagged, softness)
+
+    @property
+    def _viscous(self) -> ca.SX:
+        return self.h * self.contact.viscous_friction * (self.elastic > 0)
+
+    def _size(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """v_t and |v_t|_s."""
+        sliding = velocity[1:]
+        return sliding, ca.sqrt(ca.sumsqr(sliding) + self.softness**2)
+
+    def share(self, velocity: ca.SX) -> ca.SX:
+        """p = v_t / |v_t|_s."""
+        sliding, size = self._size(velocity)
+        return sliding / size
+
+    def next_share(self, velocity: ca.SX, share: ca.SX, change: ca.SX) -> ca.SX:
+        """p after a Newton step, with a length of at most 1."""
+        sliding, size = self._size(velocity)
+        moved = change[1:]
+        share_after = (sliding + moved - share * ca.dot(sliding / size, moved)) / size
+        return share_after / ca.fmax(1, ca.norm_2(share_after))
+
+    def impulse(self, velocity: ca.SX) -> ca.SX:
+        """gamma in N s, shape (3, 1)."""
+        along = -self.lagged * self.share(velocity) - self._viscous * velocity[1:]
+        return ca.vertcat(self._push(velocity)[0], along)
+
+    def _push(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """gamma_n and its derivative."""
+        h, k, d, leaving = self.h, self.contact.stiffness, self.contact.dissipation, velocity[0]
+        elastic, damping = self.elastic - h * k * leaving, 1 - d * leaving
+        touches = (self.elastic > 0) * (elastic > 0) * (damping > 0)
+        return touches * h * elastic * damping, -touches * h * (h * k * damping + d * elastic)
+
+    def slope(self, velocity: ca.SX, share: ca.SX) -> ca.SX:
+        """The derivative of the impulse, with p in place of one of its directions, shape (3, 3)."""
+        sliding, size = self._size(velocity)
+        plane = ca.SX.eye(2)
+        along = self.lagged / size * (plane - ca.mtimes(share, (sliding / size).T))
+        return ca.diagcat(self._push(velocity)[1], -along - self._viscous * plane)

@@ -1,0 +1,103 @@
+"""Gains as an optimum: what they have to bear, and what is refused."""
+
+import pytest
+
+from drake_dae.dae import SensedContact, SensorNoise, advised_gains
+from drake_dae.dae.one_direction import Direction, DirectionGains, sampled_loop
+from drake_dae.errors import GainError, ModelError
+
+T, ROUGHNESS = 1e-3, 1.0
+
+
+def situation(resolution, stiffness, mobility, delay, bandwidth=0.0):
+    """An arm whose noise is that of angles, filtered as differences or by an estimator."""
+    noise = SensorNoise(resolution, force=0.3, velocity_bandwidth=bandwidth)
+    return SensedContact(
+        T, delay, stiffness, mobility, 0.3, 0.7, 0.7, 5.0, noise, estimates=not bandwidth
+    )
+
+
+# In each of them faster gains were smooth enough; margins of masses or stiffness forbid them.
+SITUATIONS = [
+    (1e-4, 1e5, 0.03, 1),
+    (5e-4, 1e5, 0.3, 2),
+    (3e-6, 1e6, 0.03, 1, 300.0),
+    (1e-4, 1e5, 0.3, 1, 300.0),
+]
+
+
+@pytest.mark.parametrize("numbers", SITUATIONS)
+def test_gains_bear_other_masses_and_stiffnesses(numbers):
+    found = advised_gains(given := situation(*numbers), ROUGHNESS)
+    own, fast = found.gains, found.state_rate
+    quiet = SensorNoise(velocity_bandwidth=given.noise.velocity_bandwidth)
+    lowest, middle, highest = own.position_gains(3)
+    free = DirectionGains((lowest, middle, highest), 0.0, own.observer_rate, fast)
+    for mass in (0.5, 1.0, 2.0):
+        loop = sampled_loop(Direction(T, given.delay, mass_error=mass), free, quiet)
+        assert loop.radius < 1.0 - 0.05 * T * own.position_rate / 1.5
+    contact = DirectionGains(
+        (0.0, 0.0, own.constraint_damping), own.force_gain, own.observer_force_rate, fast
+    )
+    for mass in (2.0 / 3.0, 1.0, 1.5):
+        for share in (0.1, 0.5, 1.0, 2.0):
+            stiffness = share * given.stiffness
+            direction = Direction(T, given.delay, given.mobility, stiffness, mass)
+            assert sampled_loop(direction, contact, quiet).radius < 1.0
+    assert found.roughness <= ROUGHNESS
+
+
+@pytest.mark.parametrize("numbers", SITUATIONS)
+def test_errors_and_roughness_are_those_of_the_gains(numbers):
+    """Of the two directions, by loops that other tests compare with runs."""
+    found = advised_gains(given := situation(*numbers), ROUGHNESS)
+    own, fast = found.gains, found.state_rate
+    free = DirectionGains(tuple(own.position_gains(3)), 0.0, own.observer_rate, fast)
+    direction = Direction(T, given.delay)
+    error, _ = sampled_loop(direction, free, given.noise_of(0.7)).deviations()
+    _, jump = sampled_loop(direction, free, given.noise_of(1.0)).deviations()
+    contact = DirectionGains(
+        (0.0, 0.0, own.constraint_damping), own.force_gain, own.observer_force_rate, fast
+    )
+    pressing = Direction(T, given.delay, given.mobility, given.stiffness)
+    force, push = sampled_loop(pressing, contact, given.noise_of(0.7)).deviations()
+    assert found.noise_error == pytest.approx(error)
+    assert found.noise_force == pytest.approx(force)
+    parts = (5.0 * jump) ** 2 + (0.7 / given.mobility * push) ** 2
+    assert found.roughness == pytest.approx(parts**0.5)
+    assert found.position_error > error
+    assert found.force_error > force
+
+
+@pytest.mark.slow
+def test_within_a_bound_of_an_error_the_smoothest_gains_are_taken():
+    """Each bound alone leaves the other error as small as the roughness allows."""
+    given = situation(1e-5, 1e5, 0.03, 1)
+    best = advised_gains(given, 1.0)
+    near = advised_gains(given, 1.0, position_error=4.0 * best.position_error)
+    assert best.position_error < near.position_error <= 4.0 * best.position_error
+    assert near.gains.position_rate < 0.9 * best.gains.position_rate
+    assert near.force_error == pytest.approx(best.force_error, rel=0.1)
+    soft = advised_gains(given, 1.0, force_error=1.5 * best.force_error)
+    assert best.force_error < soft.force_error <= 1.5 * best.force_error
+    both = advised_gains(
+        given, 1.0, position_error=4.0 * best.position_error, force_error=1.5 * best.force_error
+    )
+    assert both.roughness <= near.roughness
+
+
+@pytest.mark.slow
+def test_an_error_that_no_gains_keep_is_refused_with_what_forbids_it():
+    """An unknown force with good sensors, their noise with bad ones, or the allowed roughness."""
+    good, bad = situation(1e-6, 1e5, 0.03, 1), situation(1e-3, 1e5, 0.03, 1)
+    least = advised_gains(bad, 1e3).position_error
+    with pytest.raises(GainError, match="1 N"):
+        advised_gains(good, 1.0, position_error=1e-6)
+    with pytest.raises(GainError, match="position"):
+        advised_gains(bad, 1e3, position_error=0.5 * least)
+    with pytest.raises(GainError, match=r"0\.0001 N"):
+        advised_gains(good, 1.0, force_error=1e-4)
+    with pytest.raises(GainError, match=r"0\.2"):
+        advised_gains(bad, 0.2, position_error=1.1 * least)
+    with pytest.raises(ModelError, match="position_error"):
+        advised_gains(good, 1.0, position_error=0.0)

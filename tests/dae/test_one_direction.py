@@ -1,0 +1,111 @@
+"""The sampled loop of one direction, against loops that are stepped and closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from runs import some
+from scipy.integrate import solve_ivp
+
+from drake_dae.dae import SensorNoise
+from drake_dae.dae.filters import ChainFilter, transition
+from drake_dae.dae.one_direction import Direction, DirectionGains, sampled_loop
+
+T = 1e-3
+FREE = DirectionGains((15.0**3, 2.0 * 15.0**2, 30.0), 0.0, 20.0)
+PRESSING = DirectionGains((0.0, 0.0, 23.0), 9.0, 10.0)
+CONTACT = Direction(T, 1, 0.03, 1e5)
+NOISE = SensorNoise(1e-5, 1e-3, 0.3)
+
+
+def stepped(direction, rates, noise, steps, seed=0, push=0.0):
+    """Error and asked acceleration of the loop of the docstring, sample by sample."""
+    random = np.random.default_rng(seed)
+    x, sigma, held = np.zeros(2), 0.0, [0.0] * direction.delay
+    stiff = direction.mobility * direction.stiffness
+    r, last, acted, predicted = 0.0, 0.0, 0.0, np.zeros(3)
+    w, filtered = (direction.mass_error * stiff) ** 0.5, None
+    if rates.state_rate:
+        filtered = ChainFilter.of(rates.state_rate, rates.observer_rate, T)
+    errors, wanted = np.zeros(steps), np.zeros(steps)
+    draws = random.normal(size=(steps, 3))
+    for k in range(steps):
+        position, velocity = x + draws[k, :2] * [noise.position, noise.velocity]
+        force = -direction.stiffness * x[0] + noise.force * draws[k, 2]
+        if filtered is None:
+            error, rate, d = position, velocity, r
+        else:
+            error, rate, d = known = predicted + filtered.gain[:, 0] * (position - predicted[0])
+        if stiff:
+            a = -rates.gains[2] * rate - rates.force_gain * sigma - d
+            sigma -= T * direction.mobility * force
+        else:
+            a = -np.dot(rates.gains, [sigma, error, rate]) - d
+            sigma += T * error
+        errors[k], wanted[k] = (-direction.stiffness * x[0] if stiff else x[0]), a
+        held.append(a)
+        acts = held.pop(0)
+        middle = (direction.mass_error * acts + push) / w**2 if w else 0.0
+        before = x
+        if w:
+            c, s = np.cos(w * T), np.sin(w * T)
+            away = x[0] - middle
+            x = np.array([middle + c * away + s / w * x[1], -w * s * away + c * x[1]])
+        else:
+            total = direction.mass_error * acts + push
+            x = np.array([x[0] + T * x[1] + T**2 / 2.0 * total, x[1] + T * total])
+        mean = 0.0
+        if stiff:
+            mean = -stiff * (before[0] + x[0]) / 2.0
+            mean += direction.mobility * noise.force * draws[k, 2]
+        if filtered is None:
+            gain = 1.0 - np.exp(-rates.observer_rate * T)
+            r += gain * ((velocity - last) / T - acted - r)
+            last, acted = velocity, acts + mean
+        else:
+            predicted = transition(T) @ known + (acts + mean) * np.array([T**2 / 2.0, T, 0.0])
+    return errors, wanted
+
+
+CASES = [
+    (Direction(T, 1), FREE),
+    (Direction(T, 2, mass_error=1.3), replace(FREE, state_rate=100.0)),
+    (CONTACT, PRESSING),
+    (replace(CONTACT, mass_error=0.8), replace(PRESSING, state_rate=100.0)),
+]
+
+
+MARKED = list(enumerate(CASES))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("direction", "rates"),
+    some([pytest.param(*case, marks=[pytest.mark.thorough] * (i in (1, 2))) for i, case in MARKED]),
+)
+def test_deviations_are_those_of_a_loop_with_noise(direction, rates):
+    """100 s, in which errors are correlated for some 0.2 s: 500 of them tell 3 per cent."""
+    noise = replace(NOISE, velocity=0.0) if rates.state_rate else NOISE
+    errors, wanted = stepped(direction, rates, noise, 100_000)
+    deviations = sampled_loop(direction, rates, noise).deviations()
+    assert np.std(errors[2000:]) == pytest.approx(deviations[0], rel=0.15)
+    assert np.sqrt(np.mean(np.diff(wanted[2000:]) ** 2)) == pytest.approx(deviations[1], rel=0.03)
+
+
+@pytest.mark.parametrize(("direction", "rates"), CASES)
+def test_error_after_a_step_of_the_disturbance_is_that_of_a_loop(direction, rates):
+    """Both are sums over the same samples, to round-off of sums of 5,000 numbers."""
+    errors, _ = stepped(direction, rates, SensorNoise(), 5000, push=1.0)
+    found = sampled_loop(direction, rates, SensorNoise()).after_step()
+    assert found == pytest.approx(np.linalg.norm(errors), rel=1e-6)
+
+
+def test_motion_within_a_sample_is_that_of_the_contact():
+    """phi'' = m (a - A k phi) for one sample without a control, to the integrator's 1e-12."""
+    loop = sampled_loop(replace(CONTACT, mass_error=0.7), PRESSING, SensorNoise())
+    w2 = 0.7 * 0.03 * 1e5
+    run = solve_ivp(lambda t, x: [x[1], -w2 * x[0]], (0.0, T), [1.0, 3.0], rtol=1e-12, atol=1e-14)
+    start = np.zeros(len(loop.step))
+    start[:2] = 1.0, 3.0 * T  # In units of the period.
+    assert_allclose(loop.step[:2] @ start, run.y[:, -1] * [1.0, T], rtol=1e-10)
