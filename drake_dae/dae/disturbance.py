@@ -333,7 +333,7 @@ def shares(
     return ca.vertcat(ca.SX(0, 1), *components)
 
 
-def beside(planes: ca.SX, metric: Metric, d: ca.SX) -> ca.SX:
+def orthogonal_part(planes: ca.SX, metric: Metric, d: ca.SX) -> ca.SX:
     """Returns the part of d that is orthogonal to all T y in the metric of accelerations."""
     for direction, unit in _basis(planes, metric(planes)):
         d -= ca.mtimes(direction, ca.mtimes(unit.T, d))

@@ -33,7 +33,7 @@ from drake_dae.running.c_code import (
     written,
 )
 from drake_dae.running.merged_run import upstream
-from drake_dae.systems.plant import Plant
+from drake_dae.systems.plant import Plant, port_signals
 from drake_dae.trace.compiled import generate, renamed, without_branches
 
 CONTROL = "control"  # The name of a controller's output port and a plant's input port.
@@ -188,7 +188,7 @@ class ControllerPart:
                 f"the controller acts continuously, and as one step it needs samples: {SAMPLING}"
             )
         known: Vectors = {
-            **plant.port_signals,
+            **port_signals(plant.structure),
             **plant.further_signals,
             "estimated_state": plant.dae.state_signals,
             "measured_force": plant.dae.constraint_input_signals,
