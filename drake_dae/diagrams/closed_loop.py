@@ -42,7 +42,7 @@ from drake_dae.scene.view import add_live_view
 from drake_dae.systems.applied_control import ControlHold, ControlLimits
 from drake_dae.systems.controller import Controller, PhaseChange, TrackingController, check_law
 from drake_dae.systems.estimator import StateEstimator
-from drake_dae.systems.plant import Plant
+from drake_dae.systems.plant import Plant, port_signals
 from drake_dae.systems.references import CommandedReferences, ReferenceGenerator
 from drake_dae.systems.sensors import ForceSensor, StateSensor
 
@@ -337,7 +337,8 @@ def wire_loop(
     if moving is not None:
         signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         inputs["exogenous"] = (moving.get_output_port(), signals)
-    inputs |= {name: (plant.GetOutputPort(name), s) for name, s in plant.port_signals.items()}
+    own = port_signals(plant.structure)
+    inputs |= {name: (plant.GetOutputPort(name), s) for name, s in own.items()}
     if reference is not None:
         inputs["reference"] = (goal, controller.law.reference_signals)
     named = {**inputs, "control": (control, dae.control_signals), **named}

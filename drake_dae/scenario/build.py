@@ -39,7 +39,7 @@ from drake_dae.errors import (
 from drake_dae.pictures.page.controls import PUSH
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import KnownWrench, Load, PointOnSurface, RobotModel, ScaledForce
-from drake_dae.running.divergence import DivergenceWatch
+from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
@@ -60,9 +60,9 @@ from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
 from drake_dae.systems.controller import Controller, Derived
-from drake_dae.systems.opening_contact import open_contact
 from drake_dae.systems.plant import Plant
 from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.task import open_contact
 from drake_dae.systems.task_controller import TaskController
 
 # The rows of a record under error control, after the first; and the most rows of fixed steps: a

@@ -8,8 +8,13 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, Held, stacked, where_finite
 from drake_dae.dae import Lags, Observation, TrackingLaw
-from drake_dae.dae.disturbance import DISTURBANCE, estimated_within, orthogonal_part, shares
-from drake_dae.dae.filters import ChainFilter
+from drake_dae.dae.disturbance import (
+    DISTURBANCE,
+    ChainFilter,
+    estimated_within,
+    orthogonal_part,
+    shares,
+)
 from drake_dae.errors import ModelError
 from drake_dae.systems.break_away import LITTLE, Contacts, ContactTerms, Observing
 from drake_dae.systems.estimator_parameters import MEMORY, NOISY_MEMORY, ParameterFilter, Regressor
