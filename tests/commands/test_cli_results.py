@@ -7,7 +7,7 @@ import pytest
 
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
-from drake_dae.running.export import loop as exported
+from drake_dae.running import export as exported
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
