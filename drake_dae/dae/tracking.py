@@ -171,7 +171,9 @@ class TrackingLaw:
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
         """Checks gains, or designs them, for the outputs of this law."""
         names = tuple(signal.name for signal in self.system.output_signals)
-        return designed("gains", gains, names, self.integral.all_degrees)
+        more = [i in self.integral.outputs for i in range(len(names))]  # A pole each.
+        degrees = tuple(degree + own for degree, own in zip(self.degrees, more, strict=True))
+        return designed("gains", gains, names, degrees)
 
     def all_parameters(
         self, parameters: ArrayLike | None = None, gains: GainDesign | FeedbackGains | None = None

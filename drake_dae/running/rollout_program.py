@@ -28,8 +28,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError
 from drake_dae.systems.ideal_plants import DaePlant
-from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plant import plants_in
+from drake_dae.systems.plant import ParameterizedSystem, plants_in
 from drake_dae.trace.compiled import Compiled, attempts
 
 # The seed of the noise of a run: one number, or name of a RandomSource -> number.

@@ -34,12 +34,10 @@ from drake_dae.scenario.start import start_guess, start_state
 
 T = TypeVar("T")
 
-NOTHING_FOUND = "no start was found"
-"""How the note begins if no outputs and start are good along the references."""
-
+NOTHING_FOUND = "no start was found"  # So the note begins if none is good along the references.
+# At how many times a completed scenario is examined; the excess over a limit that counts, in its
+# unit; and the size of a surface in m above which its unit is doubtful.
 _TIMES, _SLACK, _LARGE = 201, 1e-6, 10.0
-"""At how many times a completed scenario is examined; the excess over a limit that counts, in its
-unit; and the size of a surface in m above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:

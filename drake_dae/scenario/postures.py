@@ -11,6 +11,7 @@ from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.tree import WeldJoint
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.contacts import critical_factor
 from drake_dae.errors import ModelError
 from drake_dae.robots import ConstraintSet, LinkDepths, Links, LoopState, Touch
 from drake_dae.trace.functions import TracedFunction
@@ -81,8 +82,9 @@ class Posture:
         """
         J, normal = self.gradients[list(rows)], self.normals[contact]
         A_n = J @ np.linalg.solve(self.mass, J.T @ normal)
-        A_nn = float(normal @ A_n)
-        return A_nn / max(float(np.linalg.norm(A_n - A_nn * normal)), 1e-9 * A_nn)
+        A_nn = normal @ A_n
+        A_nt = float(np.linalg.norm(A_n - A_nn * normal))
+        return critical_factor(np.array([[A_nn]]), np.array([[A_nt]]), [0])
 
     def independent(self, rows: Sequence[int], more: Iterable[int], count: int) -> list[int]:
         """The first rows of `more`, at most `count`, independent of `rows` and of each other."""
@@ -91,14 +93,6 @@ class Posture:
             if len(chosen) < count and self.independence([*rows, *chosen, row]) > INDEPENDENT:
                 chosen.append(row)
         return chosen
-
-    def most_independent(self, rows: Sequence[int], more: Sequence[int], count: int) -> list[int]:
-        """`count` rows of `more`, each the most independent of those before it."""
-        chosen: list[int] = []
-        for _ in range(count):
-            rest = [row for row in more if row not in chosen]
-            chosen.append(max(rest, key=lambda row: self.independence([*rows, *chosen, row])))
-        return sorted(chosen)
 
 
 class Postures:

@@ -68,7 +68,7 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
                     moving[nq + _index_of(name, model.links.velocity_signals, "velocity")] = value
             plant.set_consistent_state(at_plant, moving, [*scenario.start.velocities])
     if loop.sensor is not None:
-        force = model.rest_forces(state[:nq], forces, parameters)
+        _, force, _ = model.balance.rest(state[:nq], forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
     return context
 

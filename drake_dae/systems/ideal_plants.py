@@ -27,8 +27,7 @@ from drake_dae.dae import (
 from drake_dae.dae.redundancy import manifold_of_left_out
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.robots import ConstraintSet, RobotModel
-from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plant import Plant, port_signals
+from drake_dae.systems.plant import ParameterizedSystem, Plant, port_signals
 
 
 @checked(ModelError)

@@ -95,21 +95,27 @@ class StateSensor(TracedSystem):
 
     The measurement of t_k = k period is held until the next sample; at t_k itself the output is a
     function of the state at that instant, which a law sampled then uses. Entries of x after q and v
-    are not changed.
+    are not changed. The output has the name of the input of Drake's controllers that it goes to,
+    `estimated_state`, although nothing is estimated here: a StateEstimator has the same port.
     """
 
     __slots__ = SHARED_DICTIONARY
     measures = True  # It is part of the machine, not of a controller that is exported alone.
 
     def __init__(self, size: int, num_positions: int, encoders: Encoders, period: float) -> None:
-        check_whole_number("num_positions", num_positions, 1)
         check_whole_number("size", size, 2 * num_positions)
         self.encoders, self.sample_period = encoders, positive("period", period)
         count = num_positions
-        resolution, bias, position_noise, velocity_noise = (
-            _each(name, getattr(encoders, name), count)
-            for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
-        )
+        numbers_of = list[FloatArray]()
+        for name in ("resolution", "position_bias", "position_noise", "velocity_noise"):
+            values = np.asarray(getattr(encoders, name), dtype=float)
+            if values.shape not in ((), (count,)):
+                raise ModelError(
+                    f"the {name} of encoders has {values.size} entries, the robot has {count} "
+                    "positions"
+                )
+            numbers_of.append(np.broadcast_to(values, (count,)))
+        resolution, bias, position_noise, velocity_noise = numbers_of
         state, held = ca.SX.sym("state", size), ca.SX.sym("held", 1 + 2 * count)
         q, v = state[:count] + bias, state[count : 2 * count]
         inputs = {"state": state}
@@ -144,16 +150,6 @@ def _rounded(number: ca.SX) -> ca.SX:
     is_tie = ca.eq(up, number + 0.5)
     is_odd = ca.eq(2.0 * ca.floor(up / 2.0) + 1.0, up)
     return up - ca.logic_and(is_tie, is_odd)
-
-
-def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
-    """One number for each position."""
-    values = np.asarray(given, dtype=float)
-    if values.shape not in ((), (count,)):
-        raise ModelError(
-            f"the {name} of encoders has {values.size} entries, the robot has {count} positions"
-        )
-    return np.broadcast_to(values, (count,))
 
 
 @checked(ModelError)
@@ -248,7 +244,6 @@ class ForceSensor(TracedSystem):
         """
         self.check_context(context)
         size = self.block.inputs["force"].numel()
-        check_whole_number("the size of a ForceSensor", size, 1)
         errors = _errors(size, bias, noise_deviation, drift)
         if errors[size : 2 * size].any() and "noise" not in self.block.inputs:
             raise ModelError("a ForceSensor that was made without noise has no port for it")

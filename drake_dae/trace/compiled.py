@@ -110,11 +110,13 @@ def _library(
     folder.mkdir(0o700, parents=True, exist_ok=True)
     _check_trusted(folder)
     with tempfile.TemporaryDirectory(dir=folder) as own:
-        file = Path(own) / "code"
-        expected = STARTING + COMPILING[level] * operations
-        compiler.compile(source, file, level, max(HANGS[0], HANGS[1] * expected), options)
-        file.with_suffix(".so").chmod(0o700)
-        os.replace(file.with_suffix(".so"), stored(level))
+        code, made = Path(own) / "code.c", Path(own) / "code.so"
+        code.write_text(source)
+        build = [*FLAGS, *compiler.target, *options, level, str(code), "-o", str(made), "-lm"]
+        patience = max(HANGS[0], HANGS[1] * (STARTING + COMPILING[level] * operations))
+        _compile([*compiler.command, *build], made, patience)
+        made.chmod(0o700)
+        os.replace(made, stored(level))
     return stored(level)
 
 
@@ -240,15 +242,6 @@ class Compiler(NamedTuple):
     command: tuple[str, ...]
     identity: str
     target: tuple[str, ...] = ()
-
-    def compile(
-        self, source: str, file: Path, level: str, seconds: float, more: tuple[str, ...] = ()
-    ) -> None:
-        """Writes C source to file.c and compiles it to file.so, by default for this processor."""
-        code, library = file.with_suffix(".c"), file.with_suffix(".so")
-        code.write_text(source)
-        options = [*FLAGS, *self.target, *more, level, str(code), "-o", str(library), "-lm"]
-        _compile([*self.command, *options], library, seconds)
 
 
 def find_compiler() -> Compiler:

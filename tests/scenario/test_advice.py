@@ -17,8 +17,13 @@ from drake_dae.errors import ScenarioError
 from drake_dae.scenario import build
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.expected import sensed_contact, stated_errors
-from drake_dae.scenario.gains import advised, estimates_all, with_all_estimated
+from drake_dae.scenario.gains import (
+    advised,
+    estimates_all,
+    sensed_contact,
+    stated_errors,
+    with_all_estimated,
+)
 from drake_dae.scenario.judging import find_feasibility, judge_run
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario, save_scenario

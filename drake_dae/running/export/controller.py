@@ -26,7 +26,7 @@ from drake_dae.running.export.c_code import (
     write_replay,
     written,
 )
-from drake_dae.systems.plant import Plant
+from drake_dae.systems.plant import Plant, port_signals
 from drake_dae.trace.compiled import generate, renamed, without_branches
 
 CONTROL = "control"  # The name of a controller's output port and a plant's input port.
@@ -172,7 +172,7 @@ class ControllerPart:
                 f"the controller acts continuously, and as one step it needs samples: {SAMPLING}"
             )
         known: Vectors = {
-            **plant.port_signals,
+            **port_signals(plant.structure),
             **plant.further_signals,
             "estimated_state": plant.dae.state_signals,
             "measured_force": plant.dae.constraint_input_signals,
