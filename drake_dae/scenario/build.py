@@ -39,7 +39,7 @@ from drake_dae.errors import (
 from drake_dae.pictures.page.controls import PUSH
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import KnownWrench, Load, PointOnSurface, RobotModel, ScaledForce
-from drake_dae.running.divergence import DivergenceWatch
+from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each

@@ -10,12 +10,12 @@ from pydrake.geometry import GeometryId
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ContactResults, ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import Frame
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, number, positive
 from drake_dae.blocks.block import Block, Held, Requirement
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.references import ExpressionReference
@@ -49,17 +49,14 @@ class ContactForces(LeafSystem):
         # Independent of the time, which changes from a record to the next sample while the state
         # does not.
         self.DeclareVectorOutputPort(
-            "contact_force",
-            3 * len(pairs),
-            port_value(self._contact_force),
-            {self.all_input_ports_ticket()},
+            "contact_force", 3 * len(pairs), weakly(self._calc), {self.all_input_ports_ticket()}
         )
 
     def again(self) -> "ContactForces":
         """Another instance."""
         return ContactForces(self._pairs)
 
-    def _contact_force(self, context: Context) -> FloatArray:
+    def _calc(self, context: Context, output: BasicVector) -> None:
         results, total = self._results.Eval(context), np.zeros(3 * len(self._pairs))
         points = map(results.point_pair_contact_info, range(results.num_point_pair_contacts()))
         patches = map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts()))
@@ -69,7 +66,7 @@ class ContactForces(LeafSystem):
         for geometry, force in forces:
             first, sign = self._owners[geometry]
             total[first : first + 3] += sign * force
-        return total
+        output.SetFromVector(total)
 
 
 def contact_block(

@@ -259,17 +259,6 @@ class ForceSensor(TracedSystem):
             bias, _, drift = np.split(context.get_numeric_parameter(0).value(), 3)
             context.SetDiscreteState(0, value + bias + drift * context.get_time())
 
-    def largest_stable_gain(self) -> float:
-        """The largest gain Gbar of (59) for which a rigid robot's force error decays.
-
-        With the lag alone it is infinite: the error decays at (1 + Gbar) / time_constant. A sampled
-        sensor multiplies it by a - (1 - a) Gbar a step, a = exp(-sample_period / time_constant).
-        """
-        if not self.sample_period:
-            return np.inf
-        a = np.exp(-self.sample_period / self.time_constant) if self.time_constant else 0.0
-        return float((1.0 + a) / (1.0 - a))
-
 
 def _errors(size: int, *errors: ArrayLike) -> FloatArray:
     """The bias, noise_deviation and drift of all forces, shape (3 m,)."""
