@@ -31,9 +31,14 @@ from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots import Constraint, LinkBehind, RobotModel, Surface, links_behind, own_values
-from drake_dae.running.judgement import FindingKind, Outcome, OutputQuality, RunFinding
-from drake_dae.running.simulate import RunStatistics
-from drake_dae.running.summary import RunSummary
+from drake_dae.running.judgement import (
+    FindingKind,
+    Outcome,
+    OutputQuality,
+    RunFinding,
+    RunStatistics,
+    RunSummary,
+)
 from drake_dae.scenario.build import check_task, tracking_law
 from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised, expected, moved_points, stated_errors

@@ -3,17 +3,20 @@
 import json
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
+from math import isfinite
 from threading import Lock
 from typing import Any
 
+import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_dae.analysis import SignalLimits, robot_limits
+from drake_dae.analysis import LimitKind, SignalLimits, SignalRange, robot_limits
 from drake_dae.arrays import brief
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import (
@@ -24,9 +27,9 @@ from drake_dae.errors import (
     ScenarioError,
     SimulationError,
 )
+from drake_dae.running.judgement import late_rms
 from drake_dae.running.rollout_program import program_of
 from drake_dae.running.simulate import simulate
-from drake_dae.running.summary import figures_of
 from drake_dae.scenario.build import build_completed, for_rollout, roll_scenario
 from drake_dae.scenario.parts import Matrices
 from drake_dae.scenario.scenario import Scenario, read_scenario, varied_data
@@ -179,6 +182,43 @@ class Runner:
         except SimulationError as error:
             failure = error
         return loop.record(context), steps, failure
+
+
+def figures_of(record: Record, ranges: Sequence[SignalRange]) -> dict[str, float]:
+    """The figures of a run: name with unit, such as "largest error of tool.z [m]" -> number.
+
+    For each output: the largest |z - r|, the last z - r, and the "late" error, the root mean square
+    of z - r over the second half of the time. For each constraint force: its least and largest
+    value. For each control: the largest |u|. Then the "margin" of each limited signal, its least
+    distance from its limits, which is negative beyond them; the largest constraint residual before
+    a projection, and the time at which the record ends. An empty record has none.
+    """
+    figures = dict[str, float]()
+
+    def add(what: str, signal: Signal, value: float) -> None:
+        figures[f"{what} {signal.name}" + (f" [{signal.unit}]" if signal.unit else "")] = value
+
+    if not record.time.size:
+        return figures
+    errors = record.signals["tracking_error"]
+    late = late_rms(record.time, errors.values) if errors.signals else ()
+    for signal, column, rms in zip(errors.signals, errors.values.T, late, strict=True):
+        add("largest error of", signal, float(np.max(np.abs(column))))
+        add("final error of", signal, float(column[-1]))
+        add("late error of", signal, float(rms))
+    forces, controls = (record.signals[name] for name in ("constraint_force", "control"))
+    for signal, column in zip(forces.signals, forces.values.T, strict=True):
+        add("least", signal, float(np.min(column)))
+        add("largest", signal, float(np.max(column)))
+    for signal, column in zip(controls.signals, controls.values.T, strict=True):
+        add("largest", signal, float(np.max(np.abs(column))))
+    for r in ranges:
+        # The margin of a force that may not pull is its least value.
+        if isfinite(r.room) and r.kind is not LimitKind.FORCE:
+            add("margin of", r.signal, r.room)
+    figures["largest residual"] = float(np.abs(record["constraint_residual"]).max(initial=0.0))
+    figures["end [s]"] = float(record.time[-1])
+    return figures
 
 
 @lru_cache(maxsize=1)
