@@ -339,11 +339,12 @@ class TreeKinematics(Kinematics):
     fewer operations than derivatives through the joints.
     """
 
+    _links: MultibodyExpressions
+
     def __init__(
         self, links: MultibodyExpressions, acceleration: ca.SX, moving: Sequence[LinkMotion]
     ) -> None:
-        self.q, self.v, self.acceleration = links.q, links.v, acceleration
-        self.position_signals = links.position_signals
+        super().__init__(links, acceleration)
         self.moving, self._links = moving, links
         self._symbols: dict[int, tuple[Frame, _FrameSymbols]] = {}
 

@@ -5,9 +5,8 @@ What changed on the way is collected, and so is what is lost.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
-from itertools import count
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
@@ -44,19 +43,13 @@ _SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "caps
 _SIZES |= {"ellipsoid": {}, "mesh": {}}
 """Shape -> how many numbers its sizes have; those of a geom of MJCF are in one list."""
 
-_MOST_INCLUDED = 1000
-"""The largest number of files that an MJCF file includes: each may include another one twice."""
-
 _TURNS = {"quat", "axisangle", "euler", "xyaxes", "zaxis"}
-
-_ONE_DEFAULT = {
-    "actuator": ["general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"],
-    "equality": ["equality"],
-}
-"""Parents in MJCF whose elements have one default -> the names under which it is written."""
 
 _SERVOS = ("position", "velocity", "intvelocity", "general")
 """Actuators whose control is no effort, while their range of forces limits an effort."""
+
+_ACTUATORS = (*_SERVOS, "motor", "damper", "cylinder")
+"""What in a class has one default, under any of these names."""
 
 _LAW = ("dyntype", "gaintype", "biastype")
 
@@ -108,14 +101,8 @@ class Mender:
                         text = f"'{value}': numbers have a point, no comma"
                         raise ModelError(f"{place_of(node)}: {text}")
             # Only the armature of joints without motor is lost.
-            for part, value, owner, is_told in take_lost(
-                root, kind, {*self.leave_out} - {ARMATURE}
-            ):
-                if is_told:
-                    item = f"{place_of(owner)}: {part} {value}"
-                    self.tell("Drake does not read, and leaves out", item)
-                else:
-                    self.lose(part, place_of(owner))
+            for part, place in take_lost(root, kind, {*self.leave_out} - {ARMATURE}):
+                self.lose(part, place)
             for inertial in root.iter("inertial"):
                 if text := _mend_inertia(inertial, kind):
                     self.lose("inertia", text)
@@ -161,28 +148,6 @@ class Mender:
                 owner.attrib.pop(key, None)
                 _remove(owner, key)
 
-    def _follow(self, model: str, joint: Element, tag: str) -> None:
-        """Takes out what a joint follows, unless Drake reports what is wrong."""
-        name = joint.get("name", "")
-        for mimic in joint.findall(tag):
-            numbers = (mimic.get("multiplier", "1"), mimic.get("offset", "0"))
-            ratio, offset = map(number_in, numbers)
-            if joint.get("type") in _OF_MANY_AXES:
-                self.lose(f"joint/{tag}", f"joint '{name}'")
-            elif ratio is not None and offset is not None and "joint" in mimic.attrib:
-                joint.remove(mimic)
-                self.joints[model, name]["follows"] = (mimic.get("joint"), ratio, offset)
-                if ratio == 0.0:
-                    self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
-
-    def _float(self, model: str, name: str, child: str, origin: str) -> None:
-        self.floating.append((model, name, child, origin))
-        kind = (
-            "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place "
-            "of a quaternion, and must not pitch by 90 degrees"
-        )
-        self.tell(kind, f"'{name}'")
-
     # Geometry.
 
     def _leave_out(self, why: str, item: str) -> None:
@@ -193,16 +158,13 @@ class Mender:
         """The file of a mesh as Drake reads it, of some kinds if any; "" if it is left out."""
         if self.folder is None:
             return str(path or "")
-        drawn, why = path, ""
+        drawn, why, way = path, "", "(robot.packages can name its folder)"
         if path is None:
-            why = (
-                "is in a package neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH "
-                "(robot.packages can name its folder)"
-            )
+            why = f"is in a package neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH {way}"
         elif not path.is_file():
             why = "is not there"
         elif not self.files.holds(path):
-            why = "is outside of the model's folder or package (robot.packages can name its folder)"
+            why = f"is outside of the model's folder or package {way}"
         elif kinds and (drawn := drawable(path, kinds)) is None:
             why = "cannot be converted (pip install 'drake_dae[meshes]' converts more)"
         elif collides and drawn and not _has_hull(str(drawn), drawn.stat().st_mtime_ns):
@@ -239,6 +201,36 @@ class Mender:
 
     # URDF and SDFormat.
 
+    def _mend_joint(self, joint: Element, owner: Element, model: str) -> None:
+        name, kind = joint.get("name", ""), joint.get("type")
+        ends = joint.find("parent"), joint.find("child")
+        words = ("" if end is None else end.get("link") or end.text or "" for end in ends)
+        parent, child = map(str.strip, words)
+        of_file, is_placed = self.joints[model, name], parent == "world" and child in self.placed
+        of_file["parent"] = parent
+        if kind == "floating" or (kind == "fixed" and is_placed):
+            owner.remove(joint)
+        if kind == "floating" and not is_placed:
+            origin = joint.find("origin")
+            own = {"name": f"{name}_origin", "link": parent, "xyz": "0 0 0", "rpy": "0 0 0"}
+            SubElement(owner, "frame", own | ({} if origin is None else origin.attrib))
+            self.floating.append((model, name, child, own["name"]))
+        for limit in joint.iterfind("limit[@effort]"):
+            of_file["effort"] = number_in(limit.get("effort", "")) or 0.0
+        # What is wrong with a mimic is reported by Drake.
+        for mimic in (*joint.findall("mimic"), *joint.findall("drake:mimic")):
+            ratio = number_in(mimic.get("multiplier", "1"))
+            offset = number_in(mimic.get("offset", "0"))
+            if kind in _OF_MANY_AXES:
+                self.lose(f"joint/{mimic.tag}", f"joint '{name}'")
+            elif kind == "fixed":
+                joint.remove(mimic)
+            elif ratio is not None and offset is not None and "joint" in mimic.attrib:
+                joint.remove(mimic)
+                of_file["follows"] = (mimic.get("joint"), ratio, offset)
+                if ratio == 0.0:
+                    self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
+
     def _mend_urdf(self, root: Element, file: Path, model: str) -> None:
         root.attrib.setdefault("name", file.stem)
         _remove(root, "mujoco")
@@ -254,38 +246,21 @@ class Mender:
                 material[:] = colours.get(material.get("name") or material, [])
                 if not len(material):
                     owner.remove(material)
-        moving, still = set[str | None](), set[str | None]()  # Still are those without a motor.
-        for joint in (*root.findall("joint"), *root.findall("drake:joint")):
-            name, kind = joint.get("name", ""), joint.get("type")
-            ends = joint.find("parent"), joint.find("child")
-            parent, child = ("" if end is None else end.get("link", "") for end in ends)
-            is_placed = parent == "world" and child in self.placed
-            if kind == "fixed":
-                _remove(joint, "mimic")
-            else:
-                moving.add(name)
-            if kind == "floating" or (kind == "fixed" and is_placed):
-                root.remove(joint)
-            if kind == "floating" and not is_placed:
-                origin = joint.find("origin")
-                own = {"name": f"{name}_origin", "link": parent, "xyz": "0 0 0", "rpy": "0 0 0"}
-                SubElement(root, "frame", own | ({} if origin is None else origin.attrib))
-                self._float(model, name, child, own["name"])
-            self._follow(model, joint, "mimic")
-            still |= {name} if kind in _OF_MANY_AXES else set()
-            for limit in joint.iterfind("limit[@effort]"):
-                effort = number_in(limit.get("effort", "")) or 0.0
-                if effort > 0.0:
-                    self.joints[model, name]["effort"] = effort
-                else:  # Many authors write 0 for an unknown limit.
-                    still.add(name)
+        joints = [*root.findall("joint"), *root.findall("drake:joint")]
+        for joint in joints:
+            self._mend_joint(joint, root, model)
+        # Many authors write 0 for an unknown limit, with which Drake makes no actuator.
+        kinds = {joint.get("name", ""): joint.get("type") for joint in joints}
+        still = {name for name in kinds if self.joints[model, name].get("effort") == 0.0}
+        still |= {name for name, kind in kinds.items() if kind in _OF_MANY_AXES}
+        moving = {name for name, kind in kinds.items() if kind != "fixed"}
         count = Counter[str]()
         for transmission in root.findall("transmission"):
-            driven = {joint.get("name") for joint in transmission.iterfind("joint")}
+            driven = {joint.get("name", "") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
-            for one in driven & still:
-                why = "its effort is 0, or it has more than one axis"
-                self.lose("transmission/joint", f"joint '{one}': {why}")
+            for name in driven & still:
+                text = f"joint '{name}': its effort is 0, or it has more than one axis"
+                self.lose("transmission/joint", text)
             if not has_type or not driven & moving or driven & still:
                 root.remove(transmission)
                 continue
@@ -306,26 +281,18 @@ class Mender:
             for link in body.iterfind("link") if self.has_geometry else ():
                 self._mend_shapes(link, file, model)
             for joint in body.findall("joint"):
-                parent, child = (joint.findtext(end, "").strip() for end in ("parent", "child"))
-                if parent == "world" and joint.get("type") == "fixed" and child in self.placed:
-                    body.remove(joint)
-                self.joints[model, joint.get("name", "")]["parent"] = parent
-                self._follow(model, joint, "drake:mimic")
+                self._mend_joint(joint, body, model)
         for joint in root.iter("joint"):
             # Drake reads one of two dampings.
             axes = (part for part in joint if part.tag in ("axis", "axis2"))
             dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
             if len({*map(number_in, dampings)}) > 1:
                 self.lose("axis2/damping", f"{place_of(joint)}: {' and '.join(dampings)}")
-            pitch = joint.find("thread_pitch")
-            if pitch is not None:  # In rad/m, of a thread that turns left.
-                joint.remove(pitch)
-                radians = number_in(pitch.text or "")
-                if radians == 0.0:
-                    text = "with thread_pitch 0 it is no screw; mend the file"
+            for pitch in joint.findall("thread_pitch"):  # In rad/m, of a thread that turns left.
+                if not (radians := number_in(pitch.text or "")):
+                    text = f"with thread_pitch {pitch.text} it is no screw; mend the file"
                     raise ModelError(f"{place_of(joint)}: {text}")
-                if radians is not None and joint.find("screw_thread_pitch") is None:
-                    SubElement(joint, "screw_thread_pitch").text = repr(-2.0 * np.pi / radians)
+                pitch.tag, pitch.text = "screw_thread_pitch", repr(-2.0 * np.pi / radians)
 
     # MJCF: each element of the copy says all that it means, where it means it.
 
@@ -337,7 +304,7 @@ class Mender:
         mass 0, which MuJoCo takes if they do not move or move with others, lose their inertia, and
         their geometry its mass.
         """
-        self._include(root, file, count(1))
+        self._include(root, file)
         root.attrib.setdefault("model", file.stem)
         _apply_defaults(root)
         options = _compiler(root)
@@ -352,7 +319,9 @@ class Mender:
             words = joint.get("range", "").split()
             if joint.get("limited", "auto" if any(map(number_in, words)) else "false") == "false":
                 joint.attrib.pop("range", None)
-        for motor in root.iterfind("actuator/*"):
+        kinds = {one.get("name", ""): one.get("type", "hinge") for one in root.iter("joint")}
+        kinds |= {one.get("name", ""): "free" for one in root.iter("freejoint")}
+        for owner, motor in [(one, motor) for one in root.iterfind("actuator") for motor in one]:
             law = motor.attrib.keys() & _OF_GENERAL if motor.tag == "general" else set()
             own, gain = {key: motor.attrib.pop(key) for key in law}, 1.0
             if motor.tag == "general" and {own.get(k, "") for k in _LAW} <= {"", "none", "fixed"}:
@@ -369,6 +338,10 @@ class Mender:
                 bounds = [number_in(word) for word in motor.get(key, "").split()]
                 if scale != 1.0 and bounds and None not in bounds:
                     motor.set(key, " ".join(repr(scale * (bound or 0.0)) for bound in bounds))
+            kind = kinds.get(motor.get("joint", ""))
+            if motor.tag == "motor" and kind in _OF_MANY_AXES:
+                owner.remove(motor)
+                self.lose(f"{kind}/motor", place_of(motor))
         for body in root.iter("body") if options.get("inertiafromgeom") != "true" else ():
             inertial = body.find("inertial")
             if inertial is not None and number_in(inertial.get("mass", "")) == 0.0:
@@ -382,17 +355,15 @@ class Mender:
             if "friction" in geom.attrib:  # Drake has none that resists turning.
                 geom.set("friction", "".join(geom.get("friction", "").split()[:1]))
 
-    def _include(self, owner: Element, main: Path, number: Iterator[int]) -> None:
+    def _include(self, owner: Element, main: Path) -> None:
         for index, node in reversed(list(enumerate(owner))):
             if node.tag != "include":
-                self._include(node, main, number)
+                self._include(node, main)
                 continue
-            if next(number) > _MOST_INCLUDED:
-                raise ModelError(f"'{main.name}' includes more than {_MOST_INCLUDED} files")
             file = main.parent / node.get("file", "")
             with self.files.within(file):
                 included = read_xml(file)
-                self._include(included, main, number)
+                self._include(included, main)
             for part in included.iter():
                 part.line = 0  # type: ignore[attr-defined]
             owner[index : index + 1] = list(included)
@@ -401,13 +372,6 @@ class Mender:
         self._mend_geoms(root, file, model)
         if not self.has_geometry:
             _remove(root, "contact")
-        kinds = {one.get("name", ""): one.get("type", "hinge") for one in root.iter("joint")}
-        kinds |= {one.get("name", ""): "free" for one in root.iter("freejoint")}
-        for owner in root.iterfind("actuator"):
-            for motor in owner.findall("motor"):
-                if (kind := kinds.get(motor.get("joint", ""))) in _OF_MANY_AXES:
-                    owner.remove(motor)
-                    self.lose(f"{kind}/motor", place_of(motor))
         for joint in root.iter("joint"):
             name, armature = joint.get("name", ""), number_in(joint.get("armature", ""))
             if armature and name and joint.get("type", "hinge") in ("hinge", "slide"):
@@ -418,7 +382,7 @@ class Mender:
             name = body.get("name", "")
             free = [*body.iterfind("freejoint"), *body.iterfind("joint[@type='free']")]
             if free and name not in self.placed:
-                self._float(model, free[0].get("name", name), name, "world")
+                self.floating.append((model, free[0].get("name", name), name, "world"))
             elif name in self.placed and not free and body.find("joint") is None:
                 SubElement(body, "freejoint")  # Else Drake welds it.
 
@@ -434,7 +398,8 @@ class Mender:
             if asset.attrib.pop("inertia", "") == "shell":
                 shells.add(asset.get("name", ""))
         hulls = {geom.get("mesh") for geom in root.iter("geom") if _collides(geom)}
-        moved = [body for body in root.iter("body") if {"joint", "freejoint"} & _tags(body)]
+        joints = "joint", "freejoint"
+        moved = [body for body in root.iter("body") if any(one.tag in joints for one in body)]
         moving = {geom for body in moved for geom in body.iter("geom")}
         bodies = [*root.iterfind("worldbody"), *root.iter("body")]
         for body, geom in [(owner, geom) for owner in bodies for geom in owner.findall("geom")]:
@@ -448,20 +413,16 @@ class Mender:
                 used[mesh] = self._mesh(own, folder / own, is_hull, (".obj",))
                 meshes[mesh].set("file", used[mesh])
             is_refused = mesh in used and not used[mesh]
-            why = "" if fault == _EMPTY and "mass" not in geom.attrib else fault
-            if is_refused or mesh in shells:
-                why = (
-                    f"is the mesh '{mesh}', which Drake cannot read, or not as a shell (trimesh "
-                    "reads more: pip install 'drake_dae[meshes]')"
-                )
-            if weighs and why:
-                text = f"body '{name}' has its mass from geometry that {why}"
+            if is_refused or (weighs and mesh in shells):
+                fault = f"is the mesh '{mesh}', which Drake cannot read, or not as a shell"
+            if weighs and fault and (fault != _EMPTY or "mass" in geom.attrib):
+                text = f"body '{name}' has its mass from geometry that {fault}"
                 raise ModelError(f"{text}; give the body an <inertial>")
             if is_seen and is_refused:
                 self.crossed.add((model, name))
             elif is_seen and fault:
                 self._leave_out(fault, f"of '{name}'")
-            if is_refused or fault or not (weighs or is_seen):
+            if fault or not (weighs or is_seen):
                 body.remove(geom)
         for owner in root.iterfind("asset"):
             for asset in owner.findall("mesh"):
@@ -476,8 +437,7 @@ def _apply_defaults(root: Element) -> None:
     def collect(default: Element, inherited: Mapping[str, dict[str, str]], name: str) -> None:
         own = dict(inherited)
         for node in default:
-            tags = (tag for tag, names in _ONE_DEFAULT.items() if node.tag in names)
-            tag = next(tags, node.tag)
+            tag = "general" if node.tag in _ACTUATORS else node.tag
             own[tag] = own.get(tag, {}) | node.attrib
         classes[default.get("class", name)] = own
         for child in default.iterfind("default"):
@@ -485,14 +445,13 @@ def _apply_defaults(root: Element) -> None:
 
     def apply(owner: Element, inherited: str) -> None:
         for node in owner:
-            tag = owner.tag if owner.tag in _ONE_DEFAULT else node.tag
-            known = classes.get(node.attrib.pop("class", inherited), {})
-            values = {} if node.tag in _ONE_DEFAULT else known.get(tag, {})
-            if owner.tag == "actuator" and node.tag != "general":
-                values = {key: value for key, value in values.items() if key not in _OF_GENERAL}
-            if _TURNS & node.attrib.keys():
-                values = {key: value for key, value in values.items() if key not in _TURNS}
-            node.attrib.update({**values, **node.attrib})
+            tag = "general" if owner.tag == "actuator" else node.tag
+            of_class = classes.get(node.attrib.pop("class", inherited), {})
+            values = of_class.get(tag, {}) if owner is not root else {}
+            gone = _TURNS if _TURNS & node.attrib.keys() else set()
+            gone = _OF_GENERAL if tag != node.tag else gone
+            known = {key: value for key, value in values.items() if key not in gone}
+            node.attrib.update(known | node.attrib)
             apply(node, node.get("childclass", inherited))
 
     for default in root.findall("default"):
@@ -509,10 +468,6 @@ def _compiler(root: Element) -> dict[str, str]:
 def _first(words: str) -> float:
     """The first number, and 1 if there is none, or 0."""
     return number_in([*words.split(), "1"][0]) or 1.0
-
-
-def _tags(owner: Element) -> set[str]:
-    return {part.tag for part in owner}
 
 
 def _collides(geom: Element) -> bool:
@@ -569,7 +524,7 @@ def _remove(owner: Element, tag: str) -> int:
 
 
 _ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-_ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+_PLACES = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])  # Of the entries in a matrix.
 
 
 def nearest_inertia(inertia: FloatArray) -> FloatArray:
@@ -588,58 +543,51 @@ def nearest_inertia(inertia: FloatArray) -> FloatArray:
 
 def _mend_inertia(inertial: Element, kind: str) -> str:
     """Replaces an impossible inertia by the nearest possible one; says what it replaced, or ""."""
-    words, matrix, place = _mass_and_entries(inertial, kind), inertial.find("inertia"), ""
-    numbers, place = [number_in(word) for word in words], place_of(inertial)
-    if None in numbers:
-        raise ModelError(f"{place}: mass and inertia are numbers, got {', '.join(words)}")
-    if len(numbers) != 7:
+    place, matrix = place_of(inertial), inertial.find("inertia")
+    # A fullinertia cannot be combined with a quat, so a diagonal one remains diagonal.
+    key = "fullinertia" if "fullinertia" in inertial.attrib else "diaginertia"
+    if kind == ".xml":
+        mass, words = inertial.get("mass", "0"), inertial.get(key, "").split()
+        words += ["0", "0", "0"] * (key == "diaginertia")
+    elif kind == ".urdf":
+        weight = inertial.find("mass")
+        mass = "0" if weight is None else weight.get("value", "0")
+        words = [] if matrix is None else [matrix.get(entry, "0") for entry in _ENTRIES]
+    else:  # The defaults of SDFormat are a unit matrix.
+        mass, own = inertial.findtext("mass", "1"), zip(_ENTRIES, "111000", strict=True)
+        words = [] if matrix is None else [matrix.findtext(entry, one) for entry, one in own]
+    if len(words) != 6:
         return ""  # Drake reports it.
-    mass, entries = numbers[0] or 0.0, np.array(numbers[1:], float)
-    if mass < 0.0:
-        raise ModelError(f"{place}: a mass is positive, got {mass:g} kg")
+    numbers = [number_in(word) for word in (mass, *words)]
+    if None in numbers:
+        raise ModelError(f"{place}: mass and inertia are numbers, got {mass}, {', '.join(words)}")
+    kilograms, *entries = np.array(numbers, float).tolist()
+    if kilograms < 0.0:
+        raise ModelError(f"{place}: a mass is positive, got {kilograms:g} kg")
     try:
-        is_possible = RotationalInertia(*entries.tolist()).CouldBePhysicallyValid()
+        is_possible = RotationalInertia(*entries).CouldBePhysicallyValid()
     except RuntimeError:
         is_possible = False
-    if not np.any(entries) if mass == 0.0 else is_possible:
+    if not any(entries) if kilograms == 0.0 else is_possible:
         return ""
-    inertia = np.empty((3, 3))
-    inertia[_ROWS, _COLUMNS] = inertia[_COLUMNS, _ROWS] = entries
-    nearest = nearest_inertia(inertia) if mass > 0.0 else np.zeros((3, 3))
+    inertia = np.array(entries)[_PLACES]
+    nearest = nearest_inertia(inertia) if kilograms > 0.0 else np.zeros((3, 3))
     before, after = np.linalg.eigvalsh(inertia), np.linalg.eigvalsh(nearest)
-    if mass > 0.0 and not np.trace(nearest) > 0.0:
+    if kilograms > 0.0 and not np.trace(nearest) > 0.0:
         raise ModelError(
             f"{place}: the moments of inertia are {before} kg m^2, and near these is none that a "
-            f"body of {mass:g} kg can have; mend them"
+            f"body of {kilograms:g} kg can have; mend them"
         )
-    written = [repr(entry) for entry in nearest[_ROWS, _COLUMNS].tolist()]
+    written = [repr(entry) for entry in nearest[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()]
     if matrix is None:
-        # A fullinertia cannot be combined with a quat, so a diagonal one remains diagonal.
-        key = "fullinertia" if "fullinertia" in inertial.attrib else "diaginertia"
         inertial.set(key, " ".join(written[: 6 if key == "fullinertia" else 3]))
     else:
         matrix.clear()
-        for key, entry in zip(_ENTRIES, written, strict=True):
+        for entry, value in zip(_ENTRIES, written, strict=True):
             if kind == ".urdf":
-                matrix.set(key, entry)
+                matrix.set(entry, value)
             else:
-                SubElement(matrix, key).text = entry
+                SubElement(matrix, entry).text = value
     was, now = (", ".join(f"{d:.3g}" for d in moments) for moments in (before, after))
     change = 100.0 * np.linalg.norm(nearest - inertia) / np.linalg.norm(inertia)
     return f"{place}: ({was}) kg m^2, nearest possible ({now}), changed by {change:.2g} %"
-
-
-def _mass_and_entries(inertial: Element, kind: str) -> list[str]:
-    """Mass in kg, and xx, yy, zz, xy, xz and yz in kg m^2; none if entries are missing."""
-    matrix = inertial.find("inertia")
-    if kind == ".xml":
-        entries = inertial.get("fullinertia", inertial.get("diaginertia", "")).split()
-        return [inertial.get("mass", "0"), *entries, *["0"] * 3][: 7 if entries[2:] else 0]
-    if matrix is None:
-        return []
-    if kind == ".urdf":
-        mass = inertial.find("mass")
-        weight = "0" if mass is None else mass.get("value", "0")
-        return [weight, *(matrix.get(key, "0") for key in _ENTRIES)]
-    own = zip(_ENTRIES, "111000", strict=True)  # The defaults of SDFormat are a unit matrix.
-    return [inertial.findtext("mass", "1"), *(matrix.findtext(key, zero) for key, zero in own)]

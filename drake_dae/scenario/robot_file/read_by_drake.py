@@ -9,7 +9,6 @@ bushings that are no part of the library's equations; a test feeds them through 
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
@@ -93,7 +92,7 @@ def write_xml(root: Element) -> str:
     return "".join(pieces)
 
 
-# "owner: parts that are read | parts that change no equation | parts that are reported". Of "a=0"
+# "owner: parts that are read | parts that change no equation | limits that are not read". Of "a=0"
 # that holds with this value only, of "a=never" with none; "*" is all others. Owners without a line
 # hold geometry. "limit@ball,screw" has what is different in joints of these types.
 _URDF = """
@@ -101,8 +100,8 @@ robot: name material link joint drake:joint transmission frame gazebo drake:line
 robot: drake:distance_constraint drake:collision_filter_group mujoco
 robot: | version sensor ros2_control disable_collisions link_group group verbose plugin
 mujoco: compiler option | *
-compiler: | * | boundmass=0 boundinertia=0 settotalmass=-1 inertiafromgeom=false/auto
-option: | * | gravity=0,0,-9.81/0,0,-9.8 density=0 viscosity=0 wind=0
+compiler: | * boundmass=0 boundinertia=0 settotalmass=-1 inertiafromgeom=0
+option: | * gravity=0,0,-9.81/0,0,-9.8 density=0 viscosity=0 wind=0
 gazebo: | * reference joint=never constraint=never gravity=1 turnGravityOff=0 springStiffness=0
 gazebo: velocity_decay | dampingFactor=0 kinematic=0 static=0 link=never model=never axis=never
 gazebo: | inertial=never
@@ -165,14 +164,9 @@ mujoco: model compiler option asset worldbody body actuator contact
 mujoco: equality | size statistic sensor keyframe visual custom extension
 compiler: coordinate angle assetdir meshdir eulerseq inertiafromgeom autolimits
 compiler: | boundmass=0 boundinertia=0 settotalmass=-1 balanceinertia=0 inertiagrouprange=0,5
-compiler: | strippath=0
-compiler: | usethread texturedir discardvisual fusestatic fitaabb saveinertial alignfree convexhull
-compiler: | exactmeshinertia conflictcheck lengthrange
-option: gravity flag | density=0 viscosity=0 wind=0
-option: | timestep apirate impratio magnetic o_margin o_solref o_solimp o_friction integrator cone
-option: | jacobian solver iterations tolerance ls_iterations ls_tolerance noslip_iterations
-option: | noslip_tolerance ccd_iterations ccd_tolerance mpr_iterations mpr_tolerance sdf_iterations
-option: | sdf_tolerance sdf_initpoints actuatorgroupdisable collision sleep_tolerance
+compiler: | strippath=0 usethread texturedir discardvisual fusestatic fitaabb saveinertial
+compiler: | alignfree convexhull exactmeshinertia conflictcheck lengthrange
+option: gravity flag | * density=0 viscosity=0 wind=0
 flag: | * constraint=enable equality=enable frictionloss=enable limit=enable passive=enable
 flag: | spring=enable damper=enable gravity=enable clampctrl=enable actuation=enable
 worldbody body: name pos quat axisangle euler xyaxes zaxis body geom joint freejoint inertial
@@ -201,8 +195,9 @@ DRIVES = ("transmission/", "actuator/", "motor/", "ball/motor", "free/motor")
 
 
 def _words(text: str) -> list[str | float]:
-    numbers = ((word, number_in(word)) for word in text.lower().split())
-    return [word if number is None else number for word, number in numbers]
+    """The words of a value, with numbers for those that are or mean numbers."""
+    words = [{"true": "1", "false": "0", "auto": "0"}.get(w, w) for w in text.lower().split()]
+    return [word if (number := number_in(word)) is None else number for word in words]
 
 
 def _is_meant(value: str, meant: str) -> bool:
@@ -211,12 +206,8 @@ def _is_meant(value: str, meant: str) -> bool:
     match meant:
         case "":
             return True
-        case "0":
-            return words in (["false"], ["auto"]) or all(number == 0.0 for number in numbers)
-        case "1":
-            return words in ([], ["true"], [1.0])
-        case "-1":
-            return all((number or 0.0) <= 0.0 for number in numbers)
+        case "0" | "1":
+            return {*words} <= {float(meant)}
         case "+-":  # A range of both directions.
             low, high = [*numbers, None, None][:2]
             return low is None or high is None or low == -high
@@ -227,17 +218,9 @@ def _is_meant(value: str, meant: str) -> bool:
     return words in [_words(way.replace(",", " ")) for way in meant.split("/")]
 
 
-class _Part(NamedTuple):
-    """How a part is taken: it is read, a value of it is without effect, or it is reported."""
-
-    is_read: bool = False
-    meant: str = "never"
-    is_told: bool = False
-
-
-def _table(text: str) -> dict[str, dict[str, _Part]]:
-    """Owner -> its parts."""
-    table: dict[str, dict[str, _Part]] = {}
+def _table(text: str) -> dict[str, dict[str, tuple[bool, str]]]:
+    """Owner -> part -> whether it is read, and the values with which it changes no equation."""
+    table: dict[str, dict[str, tuple[bool, str]]] = {}
     for line in text.strip().splitlines():
         owners, _, parts = line.partition(": ")
         for owner in owners.split():
@@ -245,7 +228,7 @@ def _table(text: str) -> dict[str, dict[str, _Part]]:
             for k, names in enumerate(parts.split("|")):
                 for part in names.split():
                     name, _, value = part.partition("=")
-                    own = _Part(k == 0, value or ("unlimited" if k == 2 else ""), k == 2)
+                    own = k == 0, value or ("unlimited" if k == 2 else "")
                     for joint in types.split(","):
                         table.setdefault(f"{tag}@{joint}".rstrip("@"), {})[name] = own
     return table
@@ -256,12 +239,11 @@ READ_BY_DRAKE = {".urdf": _table(_URDF), ".sdf": _table(_SDF), ".xml": _table(_M
 
 def take_lost(
     element: Element, kind: str, leave_out: Collection[str], joint: str = ""
-) -> Iterator[tuple[str, str, Element, bool]]:
-    """Removes what is not read of an element, and yields what is lost.
+) -> Iterator[tuple[str, str]]:
+    """Removes what is not read of an element, and yields what is lost, and where.
 
-    That is "<parent>/<name>", or "<type>/<name>" of what is lost of joints of one type; its value;
-    the element to which it belongs; and whether it is reported, not refused. `joint` is the type of
-    the joint to which the element belongs.
+    That is "<parent>/<name>", or "<type>/<name>" of what is lost of joints of one type. `joint` is
+    the type of the joint to which the element belongs.
     """
     tables = READ_BY_DRAKE[kind]
     if element.tag not in tables:
@@ -276,17 +258,17 @@ def take_lost(
         parts.append((child.tag, (child.text or "").strip() or child.get("value", ""), child))
     for name, value, node in parts:
         is_foreign = ":" in name and name not in table and not name.startswith("drake:")
-        other = _Part(name.startswith("xmlns"), "") if is_foreign else table.get("*", _Part())
-        known = table.get(name, other)
+        other = (name.startswith("xmlns"), "") if is_foreign else table.get("*", (False, "never"))
+        is_read, meant = table.get(name, other)
         part = f"{joint if name in of_type else element.tag}/{name}"
-        is_meant = _is_meant(value, known.meant)
+        is_meant = _is_meant(value, meant)
         if not is_meant and part not in leave_out:
-            yield part, value, element, known.is_told
-        if known.is_read and is_meant and part not in leave_out:
+            yield part, f"{place_of(element)}{f' {value}' * bool(value)}"
+        if is_read and is_meant and part not in leave_out:
             if node is not None:
                 yield from take_lost(node, kind, leave_out, joint)
                 own = tables.get(name, {})
-                if own and not any(part.is_read for part in own.values()):
+                if own and not any(is_read for is_read, _ in own.values()):
                     element.remove(node)
         elif node is not None:
             element.remove(node)

@@ -12,7 +12,6 @@ from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import get_native_id
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -83,6 +82,11 @@ _REMEDIES = {
 } | dict.fromkeys(DRIVES, "or name the driven joints under robot.actuators")
 """What the name of a lost part contains -> what to do besides."""
 
+_ROLL_PITCH_YAW = (
+    "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place of a "
+    "quaternion, whose length no force keeps at 1, and must not pitch by 90 degrees"
+)
+
 _RED = [0.8, 0.1, 0.1, 1.0]
 
 _MASSLESS = 1e-12
@@ -111,7 +115,7 @@ def robot_links(
 
 def finalize(plant: MultibodyPlant) -> None:
     """Finalizes a plant."""
-    with _drake_errors():
+    with _drake():
         plant.Finalize()
 
 
@@ -151,33 +155,32 @@ def read_robot(
         plant = MultibodyPlant(0.0)  # In continuous time, as (37).
         if scene_graph is not None:
             plant.RegisterAsSourceForSceneGraph(scene_graph)
-    parser, has_geometry = Parser(plant), scene_graph is not None
+    parser = Parser(plant)
     with TemporaryDirectory() as folder:
-        files = RobotFiles(robot, parser.package_map())
-        mender = Mender(files, robot, Path(folder).resolve(), has_geometry, drawn)
-        with _drake_errors(mender.originals):
+        files, own = RobotFiles(robot, parser.package_map()), Path(folder).resolve()
+        mender = Mender(files, robot, own, scene_graph is not None, drawn)
+        with _drake(mender):
             models = _mended(mender)
             if mender.lost:
                 raise ModelError(_told(mender.lost))
-            with _remarks(mender):
-                if isinstance(models, Path):
-                    parser.AddModels(str(models))
-                else:
-                    ProcessModelDirectives(models, parser)
-    for (category, kind), items in mender.told.items():
-        warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
-    with _drake_errors():
+            if isinstance(models, Path):
+                parser.AddModels(str(models))
+            else:
+                ProcessModelDirectives(models, parser)
+    with _drake():
         for model, name in sorted(mender.crossed):
             body = frame_named(plant, _scoped(model, name or "world")).body()
             for axis in range(3):
                 bar = Box(*np.where(np.arange(3) == axis, 0.06, 0.004))
                 plant.RegisterVisualGeometry(body, RigidTransform(), bar, f"left_out_{axis}", _RED)
-        # Drake has a quaternion in the place of these, whose length no constraint force keeps at 1.
         for model, name, child, origin in mender.floating:
             link = frame_named(plant, _scoped(model, child))
             start = plant.GetDefaultFloatingBaseBodyPose(link.body())
             joint = RpyFloatingJoint(name, frame_named(plant, _scoped(model, origin)), link)
             plant.AddJoint(joint).SetDefaultPose(start)
+            mender.tell(_ROLL_PITCH_YAW, f"'{name}'")
+        for (category, kind), items in mender.told.items():
+            warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
         facts = dict[JointIndex, Mapping[str, Any]]()
         for joint in joints_of(plant):
             name, model = joint.name(), plant.GetModelInstanceName(joint.model_instance())
@@ -191,7 +194,7 @@ def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
     """The packages that a robot's file names and that are not found, and what is lost of it."""
     files = RobotFiles(robot, Parser(MultibodyPlant(0.0)).package_map())
     mender = Mender(files, robot, None, has_geometry=True, drawn=False)
-    with _drake_errors():
+    with _drake():
         _mended(mender)
     return list(files.missing), list(mender.lost)
 
@@ -225,40 +228,32 @@ def _scoped(model: str, name: str) -> str:
 
 
 @contextmanager
-def _drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Iterator[None]:
-    """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
+def _drake(mender: Mender | None = None) -> Iterator[None]:
+    """Makes ModelErrors of Drake's errors, also of failed assertions, and tells what it logs."""
+    here, logger = get_native_id(), logging.getLogger("drake")
+
+    def text_of(message: object) -> str:
+        text = str(message)  # The names of copies become those of their files.
+        for copy, file in mender.originals.items() if mender is not None else ():
+            text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
+        return " ".join(text.split())
+
+    def passes(record: logging.LogRecord) -> bool:
+        if mender is None or record.thread != here or record.levelno < logging.WARNING:
+            return True
+        text = text_of(record.getMessage()).replace(" warning:", "")
+        mender.tell("Drake reads the file with remarks", text[:200])
+        return False
+
+    logger.addFilter(passes)
     try:
         yield
     except DrakeDaeError:
         raise
     except (RuntimeError, ValueError, SystemExit) as error:
-        raise ModelError(_of_originals(str(error), originals)) from None
-
-
-@contextmanager
-def _remarks(mender: Mender) -> Iterator[None]:
-    """Tells what Drake logs in this thread."""
-    here, logger = get_native_id(), logging.getLogger("drake")
-
-    def passes(record: logging.LogRecord) -> bool:
-        is_remark = record.thread == here and record.levelno >= logging.WARNING
-        if is_remark:
-            text = _of_originals(record.getMessage(), mender.originals).replace(" warning:", "")
-            mender.tell("Drake reads the file with remarks", text[:200])
-        return not is_remark
-
-    logger.addFilter(passes)
-    try:
-        yield
+        raise ModelError(text_of(error)) from None
     finally:
         logger.removeFilter(passes)
-
-
-def _of_originals(text: str, originals: Mapping[Path, Path]) -> str:
-    """A text of Drake with the names of files in the place of those of their copies."""
-    for copy, file in originals.items():
-        text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
-    return " ".join(text.split())
 
 
 def _told(lost: Mapping[str, list[str]]) -> str:
@@ -272,10 +267,9 @@ def _told(lost: Mapping[str, list[str]]) -> str:
     )
 
 
-def _listed(items: Iterable[str], most: int = 8) -> str:
+def _listed(items: Iterable[str]) -> str:
     every = list(dict.fromkeys(items))
-    more = f" and {len(every) - most} more" if len(every) > most else ""
-    return ", ".join(every[:most]) + more
+    return ", ".join(every[:8]) + (f" and {len(every) - 8} more" if len(every) > 8 else "")
 
 
 # What a scenario changes.
@@ -303,27 +297,15 @@ def _simple_joint(name: str, plant: MultibodyPlant) -> Joint:
 
 def _change(plant: MultibodyPlant, robot: Robot, facts: _Facts) -> None:
     """Applies the changes that a scenario makes to the robot of its file."""
-    # Limits that leave no room: many authors write 0 for an unknown speed.
-    unlimited = np.full(1, np.inf)
-    for joint in joints_of(plant):
-        if joint.num_positions() == 1:
-            low, high = joint.position_lower_limits(), joint.position_upper_limits()
-            if "empty_limits" in robot.leave_out and low == high:
-                joint.set_position_limits(-unlimited, unlimited)
-            if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
-                joint.set_velocity_limits(-unlimited, unlimited)
-
-    # Leaders are of the same model.
     leaders = dict[JointIndex, tuple[JointIndex, float, float]]()
-    for index, known in facts.items():
-        if "follows" in known:
-            joint, (name, ratio, offset) = plant.get_joint(index), known["follows"]
-            if name == joint.name() or not plant.HasJointNamed(name, joint.model_instance()):
-                text = f"joint '{joint.name()}' mimics '{name}', which is no other joint of its"
-                raise ModelError(f"{text} file")
-            leader = plant.GetJointByName(name, joint.model_instance())
-            leaders[index] = leader.index(), ratio, offset
-
+    follows = {index: of["follows"] for index, of in facts.items() if "follows" in of}
+    for index, (name, ratio, offset) in follows.items():
+        joint = plant.get_joint(index)
+        model = joint.model_instance()
+        if name == joint.name() or not plant.HasJointNamed(name, model):
+            text = f"joint '{joint.name()}' mimics '{name}', which is no other joint of its file"
+            raise ModelError(text)
+        leaders[index] = plant.GetJointByName(name, model).index(), ratio, offset
     if robot.base is not None:
         with at("robot.base.weld"):
             frame, pose = _unattached(robot.base.weld, plant), robot.base.pose
@@ -343,9 +325,9 @@ def _change(plant: MultibodyPlant, robot: Robot, facts: _Facts) -> None:
     add_payloads("robot.payloads", robot.payloads, plant)
 
     driven = {actuator.joint().index() for actuator in _actuators_of(plant)}
-    for name, joint in joint_names(plant).items() if ARMATURE not in robot.leave_out else ():
+    for name, joint in joint_names(plant).items():
         armature = facts.get(joint.index(), {}).get("armature")
-        if armature is not None and joint.index() not in driven:
+        if armature and joint.index() not in driven and ARMATURE not in robot.leave_out:
             raise ModelError(
                 f"joint '{name}' has an armature of {armature:g} and no motor, and Drake gives "
                 "only motors one; name it under robot.actuators, or write leave_out: "
@@ -472,7 +454,7 @@ def _drive_joints(
             actuator.set_effort_limit(limit)
     for index, name in names.items():
         joint, known = plant.get_joint(index), facts.get(index, {})
-        effort = known.get("effort", np.inf) if limits[name] is None else limits[name]
+        effort = known.get("effort") or np.inf if limits[name] is None else limits[name]
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
         actuator.set_default_rotor_inertia(known.get("armature", 0.0))
 

@@ -159,6 +159,10 @@ class Robot:
         return Path(self.file).name.split(".")[0]
 
 
+_MOST_INCLUDED = 1000
+"""The largest number of files that are included in each other."""
+
+
 class RobotFiles:
     """The file of a robot, and those that it names.
 
@@ -169,7 +173,7 @@ class RobotFiles:
 
     def __init__(self, robot: Robot, packages: PackageMap) -> None:
         self.missing: set[str] = set()
-        self._within: list[Path] = []
+        self._within, self._included = list[Path](), 0
         self.packages = packages
         packages.AddPackageXml(str(FOLDER / "models" / "package.xml"))
         for name, folder in robot.packages.items():
@@ -244,10 +248,13 @@ class RobotFiles:
 
     @contextmanager
     def within(self, file: Path) -> Iterator[None]:
-        """While what a file includes is read, refuses that this includes the file."""
+        """Refuses that a file includes itself, while what it includes is read, or too many."""
         names = " -> ".join(path.name for path in (*self._within, file))
         if file.resolve() in self._within:
             raise ModelError(f"'{file.name}' includes itself: {names}")
+        self._included += 1  # A file may include another one twice, and this one again.
+        if self._included > _MOST_INCLUDED:
+            raise ModelError(f"'{self.main.name}' includes more than {_MOST_INCLUDED} files")
         self._within.append(file.resolve())
         yield
         self._within.pop()
@@ -298,10 +305,13 @@ def _references(file: Path) -> Iterator[str]:
         check_file(file, ModelError)
         text = file.read_bytes().decode("utf-8", errors="replace").replace("\r", "\n")
         if kind == ".gltf":
-            try:  # As lists of (key, value), since a key may occur twice.
-                yield from _uris(json.loads(text, object_pairs_hook=list))
+            pairs = list[tuple[str, Any]]()  # A key may occur twice.
+            try:
+                json.loads(text, object_pairs_hook=pairs.extend)
             except (ValueError, RecursionError):
                 yield "/"  # Nobody knows what it names.
+            uris = (value for key, value in pairs if key == "uri" and isinstance(value, str))
+            yield from (uri for uri in uris if not uri.lower().startswith("data:"))
         elif kind == ".obj":
             for part in text.split("mtllib")[1:]:
                 names = part.lstrip().split("\n")[0]
@@ -309,15 +319,6 @@ def _references(file: Path) -> Iterator[str]:
         else:
             lines = text.replace("\\\n", " ").split("\n")
             yield from (word for line in lines if line[:1] != "#" for word in line.split())
-
-
-def _uris(data: Any) -> Iterator[str]:
-    """The entries "uri" of buffers, images and extensions that are no data themselves."""
-    if isinstance(data, tuple) and data[0] == "uri" and isinstance(data[1], str):
-        yield from [data[1]] if not data[1].lower().startswith("data:") else []
-    elif isinstance(data, (list, tuple)):
-        for part in data:
-            yield from _uris(part)
 
 
 def drawable(mesh: Path, kinds: tuple[str, ...]) -> Path | None:
