@@ -30,7 +30,7 @@ def demo(tmp_path_factory):
     """The default scenario, as `make demo` runs it except for its length, and with plots."""
     folder = tmp_path_factory.mktemp("demo") / "run"
     process = command("simulate", "--out", folder, "--set", "duration=2", "--set", PLOTTED)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=600)
     assert process.returncode == 0, err
     return folder, out, err
 

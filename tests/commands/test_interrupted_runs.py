@@ -39,7 +39,7 @@ def test_each_signal_in_the_middle_of_a_run(tmp_path):
     simulate(loop.diagram, context, 10.0, chosen.integrator)
     undisturbed = loop.record(context)
     for sent, process in runs.items():
-        printed, _ = process.communicate(timeout=60)
+        printed, _ = process.communicate(timeout=600)
         assert process.returncode == 128 + sent
         assert "tracking error" in printed
         left = sorted(path.name for path in folders[sent].iterdir())
@@ -79,7 +79,7 @@ sys.exit(main(["plot", "nowhere"]))
 def test_a_signal_waits_while_drake_is_loaded(sent):
     """Its modules make an ImportError of a KeyboardInterrupt, and the command ended with that."""
     words = [sys.executable, "-c", LOADING.format(sent=sent)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stderr) == (128 + signal.Signals[sent], "interrupted\n")
 
 

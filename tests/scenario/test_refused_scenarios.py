@@ -88,6 +88,7 @@ REFUSED = {
         ("outputs=[]", f"{PIN} yz}}"): "constraints: |'pin.y'",
         (f"{PIN} x}}", "outputs.0=!SurfaceCoordinates {constraint: pin}"): "outputs.0: |'pin'",
         # Outputs, gains, actuation and force.
+        ("outputs=[]", "forces=[]", "references={}"): "outputs: |2",
         "outputs.0.axes=xz": "outputs: |1|2|(tool.x, tool.z)",
         "judgement.tolerances={tool.z: -1}": "judgement.tolerances.tool.z: |-1",
         "judgement.tolerances={tool.q: 1}": "judgement.tolerances: |'tool.q'",
