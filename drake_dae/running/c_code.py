@@ -6,6 +6,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from string import Template
+from textwrap import fill
 
 import casadi as ca
 import numpy as np
@@ -159,18 +160,13 @@ def numbers(values: FloatArray) -> str:
 
 def strings(texts: Iterable[str]) -> str:
     """A C initializer list of strings, with a null pointer at its end."""
-    return braced([*map(string, texts), "0"])
+    rows = ",\n  ".join([*map(string, texts), "0"])
+    return f"{{{rows}}}"
 
 
 def braced(items: Sequence[str]) -> str:
-    """A C initializer list, wrapped to short lines."""
-    lines, last = [], ""
-    for item in items:
-        if last and len(last) + len(item) > 96:
-            lines.append(last.rstrip())
-            last = ""
-        last += f"{item}, "
-    text = "\n  ".join([*lines, last]).rstrip(", ")
+    """A C initializer list of items without spaces in strings, wrapped to short lines."""
+    text = fill(", ".join(items), 98, subsequent_indent="  ", break_on_hyphens=False)
     return f"{{{text}}}"
 
 
