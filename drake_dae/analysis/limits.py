@@ -11,7 +11,7 @@ import numpy as np
 from drake_dae.analysis.tables import digits
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import DaeSystem, PinnedMotion, Signal, Structure
-from drake_dae.dae.pinned_motion import PinnedOutputs
+from drake_dae.dae.pinned_motion import PinnedOutputs, PinnedSet
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.robots import FrictionCone, RobotModel
@@ -253,7 +253,7 @@ def limits_along(
     def slowed(i: int, rate: float, force: float = 1.0) -> FloatArray:
         goal = goals[i] * rate**powers
         goal[commanded] *= force
-        at = pinned.at(goal, p[i])
+        at = PinnedSet(pinned, goal, p[i])
         point = at.point(at.state(motion.states[i]))
         values = limits.pinned_values(point.state, point.control, point.constraint_input, p[i])
         return values[0]

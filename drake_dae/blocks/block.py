@@ -25,6 +25,11 @@ def stacked(values: Sequence[ca.SX]) -> ca.SX:
     return ca.vertcat(NOTHING, *values)
 
 
+def is_same(value: ca.SX, symbol: ca.SX) -> bool:
+    """Whether a value is a column of symbols as it stands."""
+    return value.shape == symbol.shape and bool(symbol.numel()) and ca.is_equal(value, symbol)
+
+
 @dataclass(frozen=True, eq=False)
 class Held:
     """Values that change only at t_k = offset + k period, all from the values before t_k."""

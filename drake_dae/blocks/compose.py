@@ -29,7 +29,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.block import NOTHING, Block, Held, Projection, stacked
+from drake_dae.blocks.block import NOTHING, Block, Held, Projection, is_same, stacked
 from drake_dae.blocks.primitives import symbolic_block
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
@@ -378,7 +378,7 @@ class _Walk:
             own += [Signal(f"parameter[{i}]") for i in range(len(own), count)]
             if "@" in name:  # It has no name, but an address.
                 name = name.partition("@")[0].rpartition("/")[2]
-            named += [_prefixed(name, signal) for signal in own[:count]]
+            named += [Signal(f"{name}.{signal.name}", signal.unit) for signal in own[:count]]
         return named
 
     def signals(self, outputs: Mapping[str, OutputPort]) -> dict[str, Sequence[Signal]]:
@@ -391,13 +391,6 @@ class _Walk:
             if block is not None and own in block.signals:
                 named[name] = block.signals[own]
         return named
-
-
-def _prefixed(name: str, signal: Signal) -> Signal:
-    """A checked signal with its system's name before its own, made without checks."""
-    prefixed = object.__new__(Signal)
-    vars(prefixed).update(name=f"{name}.{signal.name}", unit=signal.unit)
-    return prefixed
 
 
 def _projection(
@@ -437,29 +430,21 @@ def _grouped(
     for system, part in parts.items():
         for i, (own, each) in enumerate(part.held.items()):
             name = f"{walk.name(system)}.{own}"
-            if outputs is not None and not any(_is_same(v, each.symbol) for v in outputs):
+            if outputs is not None and not any(is_same(v, each.symbol) for v in outputs):
                 name = f"held at {each.offset:g} s + k {each.period:g} s"
                 name += "" if each.is_unrestricted else ", last"
             members = groups.setdefault(name, [])
             first = sum(member.symbol.numel() for member in members)
             places[system, i] = name, slice(first, first + each.symbol.numel())
             members.append(each)
-    return {name: _as_one(members) for name, members in groups.items()}, places
-
-
-def _as_one(members: Sequence[Held]) -> Held:
-    """Held values of one rate, stacked."""
-    begin = None
-    if any(each.begin is not None for each in members):
-        begin = stacked([ca.SX(e.start) if e.begin is None else e.begin for e in members])
-    return replace(
-        members[0],
-        symbol=stacked([each.symbol for each in members]),
-        next=stacked([each.next for each in members]),
-        start=np.concatenate([each.start for each in members]),
-        begin=begin,
-    )
-
-
-def _is_same(value: ca.SX, symbol: ca.SX) -> bool:
-    return value.shape == symbol.shape and bool(symbol.numel()) and ca.is_equal(value, symbol)
+    found = dict[str, Held]()
+    for name, members in groups.items():
+        begins = [ca.SX(e.start) if e.begin is None else e.begin for e in members]
+        found[name] = replace(
+            members[0],
+            symbol=stacked([each.symbol for each in members]),
+            next=stacked([each.next for each in members]),
+            start=np.concatenate([each.start for each in members]),
+            begin=stacked(begins) if any(e.begin is not None for e in members) else None,
+        )
+    return found, places

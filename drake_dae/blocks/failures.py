@@ -2,18 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from drake_dae.arrays import FloatArray, show_state
-from drake_dae.dae import ConstraintStructure, Manifold, Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import (
     InconsistentStateError,
     NonFiniteError,
-    PainleveError,
     SimulationError,
     SingularityError,
 )
-from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, FailureKind
+from drake_dae.trace.functions import Failure, FailureKind
 
 
 def cannot_go_on(
@@ -29,43 +26,34 @@ def simulation_error(
     failure: Failure, time: float, state: FloatArray, signals: Mapping[str, Sequence[Signal]]
 ) -> SimulationError:
     """The exception for a function without a valid value."""
-    where = f"at t = {time:.6g} s, state {show_state(state)}"
+    where, function = f"at t = {time:.6g} s, state {show_state(state)}", failure.function
     bad = ", ".join(
         signals[name][i].name if name in signals else name
         for name, entries in failure.inputs.items()
         for i in (entries if name in signals else entries[:1])
     )
+    kind: type[SimulationError] = NonFiniteError
     match failure.fault:
         case FailureKind.INPUT:
-            return NonFiniteError(
-                f"{failure.function}: its input {bad} is not finite {where}", time, state
-            )
+            text = f"{function}: its input {bad} is not finite {where}"
         case FailureKind.OVERFLOW:
-            return NonFiniteError(
-                f"{failure.function}: its input {bad} is beyond all measure {where}: it grows "
-                "without bound",
-                time,
-                state,
-            )
+            size = f"beyond all measure {where}: it grows without bound"
+            text = f"{function}: its input {bad} is {size}"
         case FailureKind.VALUE:
-            return NonFiniteError(
-                f"{failure.function} is not finite {where}: a function left its domain or is not "
-                "differentiable there, or a matrix that is inverted is singular",
-                time,
-                state,
+            text = (
+                f"{function} is not finite {where}: a function left its domain or is not "
+                "differentiable there, or a matrix that is inverted is singular"
             )
         case FailureKind.OUTSIDE:
-            return SimulationError(
-                f"{failure.function} has no value {where}: {failure.singular}", time, state
-            )
+            kind, text = SimulationError, f"{function} has no value {where}: {failure.singular}"
         case FailureKind.SINGULAR:
-            return SingularityError(
-                f"{failure.singular} is singular {where}, so {failure.function} is not determined "
-                "there: a singular configuration, through which smaller steps do not lead. Keep "
-                "away from this state, or choose other constraints or outputs",
-                time,
-                state,
+            kind = SingularityError
+            text = (
+                f"{failure.singular} is singular {where}, so {function} is not determined there: "
+                "a singular configuration, through which smaller steps do not lead. Keep away "
+                "from this state, or choose other constraints or outputs"
             )
+    return kind(text, time, state)
 
 
 def no_step_leads_on(
@@ -120,35 +108,6 @@ def _at(state: FloatArray) -> str:
     return f", state {show_state(state)}," if state.size else ""
 
 
-def off_start(name: str, manifold: Manifold, residual: FloatArray) -> InconsistentStateError:
-    """The exception for a run that starts off N*."""
-    table = ", ".join(
-        f"{signal.name} = {value:.3g} {signal.unit}"
-        for signal, value in zip(manifold.residual_signals, residual, strict=True)
-        if not abs(value) <= 1e-3 * np.max(np.abs(residual))
-    )
-    return InconsistentStateError(
-        f"{name}: the start state is not on the constraint: {table}. Call "
-        "set_consistent_state(context, guess) to start from the nearest consistent state",
-        residual,
-    )
-
-
-def assembled_otherwise(
-    name: str, left_out: Manifold, state: FloatArray, residual: FloatArray
-) -> InconsistentStateError:
-    """The exception for a start that violates redundant constraints that were left out."""
-    worst = int(np.argmax(np.abs(residual)))
-    signal = left_out.residual_signals[worst]
-    return InconsistentStateError(
-        f"{name}: the constraints that stay hold at state {show_state(state)}, but not "
-        f"the redundant '{signal.name}', which was left out: {residual[worst]:.3g} "
-        f"{signal.unit}. The robot is assembled in another way there, or a parameter moves "
-        "one of these constraints and not the others; start nearer to where all hold",
-        residual,
-    )
-
-
 def singular_configuration(
     name: str, time: float, state: FloatArray, constraints: tuple[str, ...]
 ) -> SingularityError:
@@ -162,24 +121,3 @@ def singular_configuration(
     )
     error.constraints = constraints
     return error
-
-
-def jammed_contact(
-    structure: ConstraintStructure, error: SimulationError, parameters: FloatArray
-) -> PainleveError | None:
-    """The error of a Painleve paradox; None if there is none."""
-    dae = structure.system
-    frictional = dae.frictional_contacts
-    reserve = frictional.reserve(structure.elimination.constraint_matrix)
-    (value,) = dae.trace("reserve", {"reserve": reserve}, often=False)(error.state, parameters)
-    if not value.item() < SINGULAR_PIVOT:
-        return None
-    names = ", ".join(f"'{dae.constraint_input_signals[i].name}'" for i in frictional.rows)
-    return PainleveError(
-        f"{dae.name}: Painleve paradox at the contact of {names} at t = {error.time:.6g} s, "
-        f"state {show_state(error.state)}: a principal minor of A(x) has come to "
-        f"{value.item():.2g} of what it is without friction, so that no force fits, or several. "
-        "Lower the friction, slide the other way, or hold the robot less steeply to the surface",
-        error.time,
-        error.state,
-    )

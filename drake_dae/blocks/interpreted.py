@@ -8,7 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepFunctions, StepSettings
 from drake_dae.blocks.trials import LEAST_PROGRESS, PACE_STEPS
-from drake_dae.errors import InconsistentStateError, SimulationError
+from drake_dae.errors import InconsistentStateError
 
 
 class _Ended(Exception):
@@ -17,16 +17,14 @@ class _Ended(Exception):
 
 def run_interpreted(functions: StepFunctions, problem: RunProblem, settings: StepSettings) -> Run:
     """Makes a run until its end, or to where it cannot go on."""
-    run, ending, failure = _Interpreted(functions, problem, settings), RunEnding.DONE, None
+    run, ending = _Interpreted(functions, problem, settings), RunEnding.DONE
     try:
         run.steps_to_end()
     except _Ended as ended:
         (ending,) = ended.args
-    except (SimulationError, RuntimeError) as error:  # Of Drake, where an update is its own.
-        ending, failure = RunEnding.STUCK, error
     rows = np.array(run.rows).reshape(-1, functions.row.numel_out(0))
     at = run.time, run.state, run.held, run.steps, run.before, run.next
-    return Run(rows, ending, *at, run.trial_time, run.trial, failure)
+    return Run(rows, ending, *at, run.trial_time, run.trial)
 
 
 class _Interpreted:

@@ -6,8 +6,6 @@ from types import MethodType
 from typing import Any
 from weakref import proxy
 
-from pydrake.systems.framework import BasicVector, Context
-
 SHARED_DICTIONARY: tuple[str, ...] = ()
 """The `__slots__` of classes below LeafSystem: instances use the dictionary of Drake's class.
 
@@ -21,13 +19,3 @@ def weakly(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
     """A callback by a bound method, which Drake stores in C++ without keeping its system alive."""
     weak = MethodType(method.__func__, proxy(method.__self__))  # type: ignore[attr-defined]
     return partial(weak, *first) if first else weak
-
-
-def port_value(method: Callable[..., Any], *first: Any) -> Callable[[Context, BasicVector], None]:
-    """The calculation of a vector output port by a method of a context that returns its value."""
-    value = weakly(method, *first)
-
-    def calculate(context: Context, output: BasicVector) -> None:
-        output.SetFromVector(value(context))
-
-    return calculate

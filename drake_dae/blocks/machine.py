@@ -23,14 +23,7 @@ from drake_dae.blocks.stepping import (
     tableau_of,
 )
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.compiled import (
-    Compiled,
-    gcc_options,
-    generate,
-    library,
-    renamed,
-    without_branches,
-)
+from drake_dae.trace.compiled import Compiled, generate, library, renamed, without_branches
 
 FOLDER = Path(__file__).parent
 
@@ -42,10 +35,6 @@ STOPPED = 1 << 62
 
 LANES_OPTIONS = ("-O2", "-ffp-contract=fast")
 """Fused multiply-add where the processor has it; with -O2, runs take a tenth less time."""
-
-OF_GCC = ("--param", "lra-max-considered-reload-pseudos=50")
-"""GCC then tries fewer ways to free a register: compiling takes two thirds to four fifths of the
-time, and runs one per cent more."""
 
 SLOWER = 4
 """The compile time of an operation on registers over that of an operation on numbers."""
@@ -103,7 +92,7 @@ def load(
     options: tuple[str, ...] = ()
     if several:
         operations *= SLOWER if compiled is True else 1
-        options = (*LANES_OPTIONS, *gcc_options(*OF_GCC))
+        options = LANES_OPTIONS
     path = library(source(functions, constants, several), operations, compiled, make, options)
     if path is None:
         return None

@@ -27,7 +27,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed
-from drake_dae.blocks.block import Block, BlockFunction, stacked
+from drake_dae.blocks.block import Block, BlockFunction, is_same, stacked
 from drake_dae.blocks.failures import off_manifold, simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.blocks.trials import StepWatch
@@ -246,7 +246,7 @@ def _declare(system: Any, scalar: type, make: Make) -> None:
         system.DeclareContinuousState(vector(block.default("state")))
     system._readers = readers
     for name, value in block.outputs.items():
-        same = [n for n, h in block.held.items() if _is_same(value, h.symbol)]
+        same = [n for n, h in block.held.items() if is_same(value, h.symbol)]
         if same:  # Drake copies it. A continuous state would be stale in trials.
             system.DeclareStateOutputPort(name, groups[same[0]])
             continue
@@ -285,10 +285,6 @@ def _optional(port: InputPort, evaluate: Evaluate) -> Reader:
     """Reads an input port, or its default without a wire."""
     weak = proxy(port)
     return lambda context: weak.Eval(context) if weak.HasValue(context) else evaluate(context)[0]
-
-
-def _is_same(value: ca.SX, symbol: ca.SX) -> bool:
-    return value.shape == symbol.shape and bool(symbol.numel()) and ca.is_equal(value, symbol)
 
 
 def _set_output(evaluate: Evaluate, context: Context, output: Any) -> None:

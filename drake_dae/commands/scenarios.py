@@ -178,8 +178,7 @@ def page_command(options: argparse.Namespace) -> int:
 
 def export_command(options: argparse.Namespace) -> int:
     """Writes the controller and the whole loop as C99, as far as that can be."""
-    from drake_dae.running.export.controller import export_controller
-    from drake_dae.running.export.loop import export_loop
+    from drake_dae.running.export import export_controller, export_loop
 
     path = find_scenario(options.scenario)
     folder = options.out or Path(f"{path.stem}_c99")

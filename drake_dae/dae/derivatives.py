@@ -95,7 +95,12 @@ class Derivatives:
     def derivative(self, expression: ca.SX) -> ca.SX:
         """Returns the time derivative of an expression along the motion."""
         if ca.depends_on(expression, self._symbols[-1]):
-            self._add_order()
+            following, size = self._next_unknown(), self._balance.numel()
+            self._rates.append(following)
+            both = self._total_derivative(ca.vertcat(self._balance, self._constraint_rate))
+            self._balance, self._constraint_rate = both[:size, :], both[size:, :]
+            self._symbols.append(following)
+            self._solve_order()
         return self._total_derivative(expression)
 
     def expand(self, expression: ca.SX) -> ca.SX:
@@ -104,7 +109,7 @@ class Derivatives:
 
     def by_control(self, expression: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Returns a(x) and B(x) of an expression a(x) + B(x) u of the motion."""
-        orders = self._orders_in(expression)
+        orders = self.orders_in(expression)
         slope = self._slope(expression, orders)
         unknowns = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
         zero = ca.SX.zeros(self.control.numel())
@@ -117,7 +122,7 @@ class Derivatives:
         size = expression.numel()
         return both[:size, :], ca.sparsify(ca.reshape(both[size:, :], slope.shape))
 
-    def _orders_in(self, expression: ca.SX) -> int:
+    def orders_in(self, expression: ca.SX) -> int:
         """The number of orders of unknowns in an expression."""
         used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(expression, w)]
         return max(used, default=0)
@@ -136,10 +141,6 @@ class Derivatives:
             slope += ca.mtimes(ca.jacobian(expression, unknown[which]), moves[which, :])
         return slope
 
-    def has_unknowns(self, expression: ca.SX) -> bool:
-        """Returns whether an expression contains unknowns, so that A(x) must be regular."""
-        return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
-
     def inverse(
         self, expression: ca.SX, desired: ca.SX, shown: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX, ca.SX] | None:
@@ -152,7 +153,7 @@ class Derivatives:
         determined, and what is shown; None if the equations are not linear in what it moves.
         """
         shown = ca.SX(0, 1) if shown is None else shown
-        orders = self._orders_in(ca.vertcat(expression, shown))
+        orders = self.orders_in(ca.vertcat(expression, shown))
         symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
         values = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
         moved = ca.which_depends(values, self.control, 1, True) if orders else []
@@ -250,15 +251,6 @@ class Derivatives:
         moving = self._symbols[: len(self._rates)]
         rate = ca.jtimes(expression, ca.vertcat(*moving), ca.densify(ca.vertcat(*self._rates)))
         return rate + self.system.exogenous.rate(expression) if self.system.exogenous else rate
-
-    def _add_order(self) -> None:
-        following = self._next_unknown()
-        self._rates.append(following)
-        size = self._balance.numel()
-        both = self._total_derivative(ca.vertcat(self._balance, self._constraint_rate))
-        self._balance, self._constraint_rate = both[:size, :], both[size:, :]
-        self._symbols.append(following)
-        self._solve_order()
 
     def _solve_order(self, damping: ca.SX | None = None) -> None:
         """Solves for the newest unknowns, which enter the balance and constraint rate linearly."""

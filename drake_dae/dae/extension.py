@@ -104,10 +104,10 @@ def dynamic_extension(
             f"{system.name}: control_metric compares controls, not their derivatives; leave it "
             "out, and give the extended system one"
         )
-    given, names = nominal_control or {}, [signal.name for signal in system.control_signals]
+    values, names = nominal_control or {}, [signal.name for signal in system.control_signals]
     held = np.zeros(len(names))
-    places = places_of("control", given, system.control_signals, f"{system.name}: ")
-    held[places] = list(given.values())
+    places = places_of("control", values, system.control_signals, f"{system.name}: ")
+    held[places] = list(values.values())
     spreads = spread_of(system, spread)
     bases = [(signal, 0) for signal in system.control_signals]  # And how often integrated.
     extended, integrators = system, dict[str, int]()

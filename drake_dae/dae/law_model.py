@@ -243,11 +243,6 @@ class IntegralAction:
         self.signals = tuple(named)
         self.symbol = ca.SX.sym("integral", len(self.outputs))
 
-    @property
-    def all_degrees(self) -> tuple[int, ...]:
-        """The number of poles of each output."""
-        return tuple(degree + (i in self.outputs) for i, degree in enumerate(self.degrees))
-
     def coordinates(self, errors: ca.SX) -> ca.SX:
         """Returns the error coordinates, with the integrals among them."""
         rows = [ca.SX(0, 1)]

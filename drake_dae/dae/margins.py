@@ -88,9 +88,8 @@ def find_margin(
             along = gradient(state, *pair, system.parameter_values)[0]
             return float(values[-1]), np.where(np.isfinite(along), along, 0.0)
 
-        box = samples.surroundings()
         starts = np.argsort(distances, kind="stable")[:3]
-        lowest = [box.descend(samples.manifold, slope, candidates[start]) for start in starts]
+        lowest = [samples.descend(slope, candidates[start]) for start in starts]
         candidates += lowest
         distances += [distance(state) for state in lowest]
     state = candidates[int(np.argmin(distances))]
@@ -194,7 +193,7 @@ class ContactMargins:
         self, samples: Samples, best: ContactMargin, parameters: FloatArray
     ) -> ContactMargin:
         """The margin at a state in the Painleve paradox with as little friction as can be found."""
-        box, unit = samples.surroundings(), self._direction(parameters)
+        unit = self._direction(parameters)
 
         def reserve(state: FloatArray) -> tuple[float, FloatArray]:
             """The margin as far as it is positive, and its gradient."""
@@ -207,7 +206,7 @@ class ContactMargins:
             for _ in range(20):
                 size = part * best.lowest if np.isfinite(best.lowest) else 1e3
                 values = self._with_friction(parameters, size * unit / max(unit))
-                state = box.descend(samples.manifold, reserve, best.state)
+                state = samples.descend(reserve, best.state)
                 lower = self.at(state, parameters)
                 if not lower.lowest < best.lowest:
                     break

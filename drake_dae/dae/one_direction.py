@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.filters import ChainFilter, transition
+from drake_dae.dae.disturbance import ChainFilter, transition
 
 
 @dataclass(frozen=True)

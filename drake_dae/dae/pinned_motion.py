@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import casadi as ca
@@ -95,10 +96,6 @@ class PinnedOutputs:
         }
         self.motion = system.trace("pinned motion", motion, inputs)
 
-    def at(self, reference: FloatArray, parameters: FloatArray) -> "PinnedSet":
-        """Returns Z(R) for one R and values of all parameters."""
-        return PinnedSet(self, reference, parameters)
-
     def at_time(
         self, reference: TimeFunction, parameters: TimeFunction, time: float
     ) -> "PinnedSet":
@@ -114,7 +111,7 @@ class PinnedOutputs:
         if not np.all(np.isfinite(goal)):
             text = f"{self.system.name}: the reference is not finite at t = {time:.6g} s"
             raise NonFiniteError(text, time, goal)
-        return self.at(goal, parameters(time))
+        return PinnedSet(self, goal, parameters(time))
 
     @cached_property
     def slope(self) -> TracedFunction:
@@ -296,7 +293,8 @@ def follow(
     def rows(values: list[FloatArray], width: int) -> FloatArray:
         return np.array(values).reshape(len(points), width)
 
-    moments, margins = times[: len(points)], rows([np.array(p.margins) for p in points], 2)
+    moments = times[: len(points)]
+    margins = rows([np.array(point.margins) for point in points], 2)
     return PinnedMotion(
         moments,
         rows([point.state for point in points], system.num_states),
@@ -324,10 +322,13 @@ class _Follower:
         self._remaining = MOST_STEPS + len(times)
         self._last: PinnedPoint
         self._largest: FloatArray  # The largest margins so far.
+        self._step, self._change = np.inf, np.zeros(self._system.num_states)
+        self._bound = np.inf
+        self._integrator: scipy.integrate.Radau | None = None
 
     def points(self, guess: FloatArray) -> Iterator[PinnedPoint]:
         """Yields the points of the motion, one for each time."""
-        first = self._at(self._time)
+        first, scale = self._at(self._time), self._system.scale
         try:
             self._last = first.point(first.state(guess))
         except InconsistentStateError as error:
@@ -336,56 +337,48 @@ class _Follower:
         if self._last.flaw:
             raise self._stop(EndCause.SINGULAR_START, f"x = {show(self._last.state)}")
         self._largest = np.array(self._last.margins)
+        self._bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / scale)))
         yield self._last
         has_dynamics = self._pinned.structure.zero_dynamics_dimension > 0
-        yield from self._integrate() if has_dynamics else self._continue()
-
-    def _continue(self) -> Iterator[PinnedPoint]:
-        """Continues without zero dynamics, by a predictor and Newton's method."""
-        step, change = np.inf, np.zeros(self._last.state.size)
-        for end in self._times[1:]:
-            interval = end - self._time
+        advance = self._integrate if has_dynamics else self._continue
+        for begin, end in pairwise(self._times):
             while self._time < end:
-                step = min(step, end - self._time)
-                time = end if step == end - self._time else self._time + step
-                before = self._last
-                # Adams-Bashforth: x' and its change since the previous step.
-                if self._reach(time, before.state + step * (before.rate + 0.5 * step * change)):
-                    change = (self._last.rate - before.rate) / step
-                    step *= 2.0
-                else:
-                    step *= 0.5
-                    if step < SHORTEST * interval:
-                        raise self._end(0.1 * interval)
+                advance(end, end - begin)
             yield self._last
 
-    def _integrate(self) -> Iterator[PinnedPoint]:
-        """Continues with zero dynamics, by an implicit integrator, since they may be stiff."""
-        scale = self._system.scale
-        bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / scale)))
-        integrator = None
-        for end in self._times[1:]:
-            interval = end - self._time
-            integrator = integrator or self._integrator(end)
-            integrator.t_bound, integrator.status = end, "running"
-            while self._time < end:
-                integrator.step()
-                if integrator.status == "failed":
-                    raise self._end(0.1 * interval)
-                worst = int(np.argmax(np.abs(integrator.y) / scale))
-                if abs(integrator.y[worst]) > bound * scale[worst]:
-                    name = self._system.state_signals[worst].name
-                    raise self._stop(EndCause.UNBOUNDED, f"{name} = {integrator.y[worst]:.3g}")
-                if self._reach(integrator.t, integrator.y):
-                    integrator.y, integrator.f = self._last.state.copy(), self._last.rate.copy()
-                else:
-                    step = 0.5 * (integrator.t - self._time)
-                    if step < SHORTEST * interval:
-                        raise self._end(0.1 * interval)
-                    integrator = self._integrator(end, step)
-            yield self._last
+    def _continue(self, end: float, interval: float) -> None:
+        """A step without zero dynamics, by a predictor and Newton's method."""
+        step, before = min(self._step, end - self._time), self._last
+        time = end if step == end - self._time else self._time + step
+        # Adams-Bashforth: x' and its change since the previous step.
+        if self._reach(time, before.state + step * (before.rate + 0.5 * step * self._change)):
+            self._step, self._change = 2.0 * step, (self._last.rate - before.rate) / step
+        else:
+            self._step = 0.5 * step
+            if self._step < SHORTEST * interval:
+                raise self._end(0.1 * interval)
 
-    def _integrator(self, end: float, step: float | None = None) -> "scipy.integrate.Radau":
+    def _integrate(self, end: float, interval: float) -> None:
+        """A step with zero dynamics, by an implicit integrator, since they may be stiff."""
+        integrator, scale = self._integrator or self._radau(end), self._system.scale
+        self._integrator = integrator
+        integrator.t_bound, integrator.status = end, "running"
+        integrator.step()
+        if integrator.status == "failed":
+            raise self._end(0.1 * interval)
+        worst = int(np.argmax(np.abs(integrator.y) / scale))
+        if abs(integrator.y[worst]) > self._bound * scale[worst]:
+            name = self._system.state_signals[worst].name
+            raise self._stop(EndCause.UNBOUNDED, f"{name} = {integrator.y[worst]:.3g}")
+        if self._reach(integrator.t, integrator.y):
+            integrator.y, integrator.f = self._last.state.copy(), self._last.rate.copy()
+        else:
+            step = 0.5 * (integrator.t - self._time)
+            if step < SHORTEST * interval:
+                raise self._end(0.1 * interval)
+            self._integrator = self._radau(end, step)
+
+    def _radau(self, end: float, step: float | None = None) -> "scipy.integrate.Radau":
         """An integrator of x' = f* + h* u from the last point."""
 
         def slopes(time: float, state: FloatArray) -> FloatArray:
@@ -443,10 +436,10 @@ class _Follower:
             size = np.maximum(1.0, np.abs(last.state) / system.scale)
             rates = np.abs(last.rate) / system.scale * elapsed / size
             worst = int(np.argmax(rates))
-            if rates[worst] > GROWN:
-                rate = f"{system.state_signals[worst].name}' = {last.rate[worst]:.3g}"
-                return self._stop(EndCause.UNBOUNDED, rate)
-            return self._stop(EndCause.NO_WAY_ON, f"x = {show(last.state)}")
+            if not rates[worst] > GROWN:
+                return self._stop(EndCause.NO_WAY_ON, f"x = {show(last.state)}")
+            rate = f"{system.state_signals[worst].name}' = {last.rate[worst]:.3g}"
+            return self._stop(EndCause.UNBOUNDED, rate)
         ahead = min(ahead, self._times[-1] - self._time)
         pinned = self._at(self._time + ahead)
         guesses = last.state, last.state + ahead * last.rate

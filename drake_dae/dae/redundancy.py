@@ -103,10 +103,10 @@ def share_forces(
         ModelError: As of `drop_constraints`; or a compliance is not positive, or an output is not a
             function of the sum G v_all, and so not determined.
     """
-    weights, given = np.ones(system.num_constraints), compliances or {}
+    weights, own = np.ones(system.num_constraints), compliances or {}
     signals, owner = system.constraint_input_signals, f"{system.name}: "
-    for name, i in zip(given, places_of("constraint force", given, signals, owner), strict=True):
-        weights[i] = positive_number(f"{owner}the compliance of '{name}'", given[name])
+    for name, i in zip(own, places_of("constraint force", own, signals, owner), strict=True):
+        weights[i] = positive_number(f"{owner}the compliance of '{name}'", own[name])
     samples = all_constraints_hold(system)
     kept, left_out = _independent(samples) if names is None else _split(system, names)
     if not left_out:

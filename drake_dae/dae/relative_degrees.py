@@ -116,7 +116,7 @@ def output_chains(
                     others.examine(i, 4, 0, samples, actions.feedthrough, i)
                 still.append(i)
                 chains[i].append(following[row])
-                need_force = need_force or derivatives.has_unknowns(moving[row])
+                need_force = need_force or derivatives.orders_in(moving[row]) > 0
         if not still:
             break
         last = ca.vertcat(*[chains[i][-1] for i in still])

@@ -1,6 +1,7 @@
 """Consistent states in a box, numbers of expressions at them, and members of a family."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -32,123 +33,6 @@ UNKNOWN = 10.0  # A margin where there is no consistent state; others are at mos
 SAME = 1e-3
 # A function of a consistent state and the values of all parameters.
 OfMember = Callable[[FloatArray, FloatArray], float]
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """The states x with low <= x <= high; those on N* are found for the default parameters."""
-
-    low: FloatArray
-    high: FloatArray
-
-    def holds(self, state: FloatArray) -> bool:
-        """Returns whether a state is in the region."""
-        largest = np.maximum(np.abs(self.low), np.abs(self.high))
-        slack = SLACK * np.maximum(largest, self.high - self.low)
-        return bool(np.all((state >= self.low - slack) & (state <= self.high + slack)))
-
-    def project(self, manifold: Manifold, guess: FloatArray) -> FloatArray:
-        """Returns a consistent state in the region, near a guess."""
-        try:
-            state = manifold.project(guess)
-            if self.holds(state):
-                return state
-        except InconsistentStateError:
-            pass
-        state = manifold.project(self._newton(manifold, guess))
-        if not self.holds(state):
-            raise InconsistentStateError(
-                f"{manifold.system.name}: no consistent state found in the region",
-                manifold.residual(np.clip(state, self.low, self.high)),
-            )
-        return state
-
-    def descend(
-        self,
-        manifold: Manifold,
-        function: Callable[[FloatArray], tuple[float, FloatArray]],
-        start: FloatArray,
-    ) -> FloatArray:
-        """Minimizes a nonnegative function along N*, by steps to the zero of the linearized one.
-
-        Zeros are found in a few steps. A positive minimum is only approached.
-        """
-        width = self.high - self.low
-        state, (value, gradient) = start, function(start)
-        for _ in range(40):
-            direction = self._downhill(manifold.gradients(state) * width, state, gradient, width)
-            slope = float(direction @ direction)
-            # In units of the box: the state moves by the width times this.
-            if not value > 0.0 or not np.sqrt(slope) > FLAT * value:
-                break
-            step = width * direction
-            edge, moving = np.where(step < 0.0, self.low, self.high), step != 0.0
-            with np.errstate(over="ignore"):
-                room = np.min((edge - state)[moving] / step[moving], initial=np.inf)
-            length = min(value / slope, float(room))
-            for _ in range(6):
-                try:
-                    trial = self.project(manifold, state + length * step)
-                    trial_value, trial_gradient = function(trial)
-                    if trial_value < value:
-                        break
-                except InconsistentStateError:
-                    pass
-                length /= 4.0
-            else:
-                break
-            state, value, gradient = trial, trial_value, trial_gradient
-        return state
-
-    def _downhill(
-        self, rows: FloatArray, state: FloatArray, gradient: FloatArray, width: FloatArray
-    ) -> FloatArray:
-        """The descent direction along N* that stays in the box, in units of the box."""
-        slope, fixed = gradient * width, np.zeros(state.size, dtype=bool)
-        while True:
-            normal = np.vstack([rows, np.eye(state.size)[fixed]])
-            length = np.linalg.norm(normal, axis=1)
-            normal = normal[length > 0.0] / length[length > 0.0, None]
-            direction = normal.T @ np.linalg.lstsq(normal.T, slope)[0] - slope
-            blocked = (direction < 0.0) & (state <= self.low + SLACK * width)
-            blocked |= (direction > 0.0) & (state >= self.high - SLACK * width)
-            if not np.any(blocked & ~fixed):
-                return np.where(fixed, 0.0, direction)
-            fixed |= blocked
-
-    def _newton(self, manifold: Manifold, guess: FloatArray) -> FloatArray:
-        """The result of Newton's method for the constraints, with steps inside the box."""
-        scale = manifold.scale
-        low, high = self.low / scale, self.high / scale
-
-        def linearize(z: FloatArray) -> NewtonModel | None:
-            gradient = manifold.gradients(scale * z) * scale
-            if not np.all(np.isfinite(gradient)):
-                return None
-
-            def step(z: FloatArray) -> FloatArray:
-                residual = manifold.residual(scale * z)
-                return _bounded_step(gradient, residual, low - z, high - z)
-
-            return NewtonModel(step, True)
-
-        return scale * newton(np.clip(guess / scale, low, high), linearize)[0]
-
-
-def _bounded_step(
-    gradient: FloatArray, residual: FloatArray, low: FloatArray, high: FloatArray
-) -> FloatArray:
-    """A short dx with C dx + r = 0; components are limited by the bounds."""
-    step, free = np.zeros(low.size), low < high
-    while free.any():
-        remaining = residual + gradient[:, ~free] @ step[~free]
-        step[free] = -np.linalg.lstsq(gradient[:, free], remaining)[0]
-        past = free & ((step < low) | (step > high))
-        step[past] = np.clip(step[past], low[past], high[past])
-        free &= ~past
-        if not past.any():
-            break
-    return step
 
 
 class Samples:
@@ -194,9 +78,107 @@ class Samples:
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
         return all(are_dependent(gradient * self.scale) for (gradient,) in gradients)
 
-    def surroundings(self) -> Region:
-        """The box that the states span."""
-        return Region(self.states.min(axis=0), self.states.max(axis=0))
+    def descend(
+        self, function: Callable[[FloatArray], tuple[float, FloatArray]], start: FloatArray
+    ) -> FloatArray:
+        """Minimizes a nonnegative function along N* in the box that the states span.
+
+        Steps lead to the zero of the linearized function. Zeros are found in a few steps; a
+        positive minimum is only approached.
+        """
+        low, high = self._box
+        width, manifold = high - low, self.manifold
+        state, (value, gradient) = start, function(start)
+        for _ in range(40):
+            direction = self._downhill(manifold.gradients(state) * width, state, gradient)
+            slope = float(direction @ direction)
+            # In units of the box: the state moves by the width times this.
+            if not value > 0.0 or not np.sqrt(slope) > FLAT * value:
+                break
+            step = width * direction
+            edge, moving = np.where(step < 0.0, low, high), step != 0.0
+            with np.errstate(over="ignore"):
+                room = np.min((edge - state)[moving] / step[moving], initial=np.inf)
+            length = min(value / slope, float(room))
+            for _ in range(6):
+                try:
+                    trial = self._project(state + length * step)
+                    trial_value, trial_gradient = function(trial)
+                    if trial_value < value:
+                        break
+                except InconsistentStateError:
+                    pass
+                length /= 4.0
+            else:
+                break
+            state, value, gradient = trial, trial_value, trial_gradient
+        return state
+
+    @property
+    def _box(self) -> tuple[FloatArray, FloatArray]:
+        return self.states.min(axis=0), self.states.max(axis=0)
+
+    def _downhill(self, rows: FloatArray, state: FloatArray, gradient: FloatArray) -> FloatArray:
+        """The descent direction along N* that stays in the box, in units of the box."""
+        low, high = self._box
+        width, fixed = high - low, np.zeros(state.size, dtype=bool)
+        slope = gradient * width
+        while True:
+            normal = np.vstack([rows, np.eye(state.size)[fixed]])
+            length = np.linalg.norm(normal, axis=1)
+            normal = normal[length > 0.0] / length[length > 0.0, None]
+            direction = normal.T @ np.linalg.lstsq(normal.T, slope)[0] - slope
+            blocked = (direction < 0.0) & (state <= low + SLACK * width)
+            blocked |= (direction > 0.0) & (state >= high - SLACK * width)
+            if not np.any(blocked & ~fixed):
+                return np.where(fixed, 0.0, direction)
+            fixed |= blocked
+
+    def _project(self, guess: FloatArray) -> FloatArray:
+        """A consistent state in the box near a guess; by Newton steps inside it if need be."""
+        (low, high), manifold, scale = self._box, self.manifold, self.system.scale
+        slack = SLACK * np.maximum(np.maximum(np.abs(low), np.abs(high)), high - low)
+
+        def holds(state: FloatArray) -> bool:
+            return bool(np.all((state >= low - slack) & (state <= high + slack)))
+
+        def linearize(z: FloatArray) -> NewtonModel | None:
+            gradient = manifold.gradients(scale * z) * scale
+            if not np.all(np.isfinite(gradient)):
+                return None
+
+            def step(z: FloatArray) -> FloatArray:
+                residual = manifold.residual(scale * z)
+                return _bounded_step(gradient, residual, low / scale - z, high / scale - z)
+
+            return NewtonModel(step, True)
+
+        with suppress(InconsistentStateError):
+            state = manifold.project(guess)
+            if holds(state):
+                return state
+        start = np.clip(guess / scale, low / scale, high / scale)
+        state = manifold.project(scale * newton(start, linearize)[0])
+        if not holds(state):
+            text = f"{self.system.name}: no consistent state found between the samples"
+            raise InconsistentStateError(text, manifold.residual(np.clip(state, low, high)))
+        return state
+
+
+def _bounded_step(
+    gradient: FloatArray, residual: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """A short dx with C dx + r = 0; components are limited by the bounds."""
+    step, free = np.zeros(low.size), low < high
+    while free.any():
+        remaining = residual + gradient[:, ~free] @ step[~free]
+        step[free] = -np.linalg.lstsq(gradient[:, free], remaining)[0]
+        past = free & ((step < low) | (step > high))
+        step[past] = np.clip(step[past], low[past], high[past])
+        free &= ~past
+        if not past.any():
+            break
+    return step
 
 
 def outside(system: DaeSystem, what: str, state: FloatArray) -> ModelError:

@@ -12,26 +12,19 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
 
-import casadi as ca
 import numpy as np
 import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.manifold import coordinates, tangent
-from drake_dae.dae.pinned_motion import GROWN, PinnedMotion, PinnedOutputs, PinnedPoint, PinnedSet
+from drake_dae.dae.pinned_motion import GROWN, PinnedMotion, PinnedSet
 from drake_dae.dae.structure import Structure
-from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.numerics import DEPENDENT, ROUND_OFF, NewtonModel, newton, shortest_steps
+from drake_dae.errors import ModelError
 
 LINEARIZED = 1e-11  # The error of a linearization, relative to the terms in each of its entries.
 ROUNDED = 1e-15  # The error of computed eigenvalues, relative to the norm of the matrix.
 SHIFT = 1e-7  # The error of an equilibrium, relative to the size of the states.
-AT_REST = 1e-8  # A state is at rest if the terms of E x' cancel to this, relative to their sizes.
-ISOLATED = 1e-6  # An equilibrium is known to this distance, relative to the scale of the states.
-# The distance, relative to the scale, within which the slopes must be nearly constant.
-NEARBY = 1e-5
-SAME = 0.5  # The allowed relative change of the slopes there: then Newton's method contracts.
 # Along a periodic motion:
 ACCURACY = 1e-9  # The error of an integration step, relative to the scale of the states.
 MOST_STEPS = 5000  # The largest number of integration steps in a period.
@@ -177,131 +170,6 @@ def without_dynamics(structure: Structure) -> Stability:
             )
             return Stability(Verdict.UNDECIDED, reason)
     return Stability(Verdict.STABLE, "no zero dynamics: the reference alone determines the motion")
-
-
-class Equilibria:
-    """The equilibria on Z(R)."""
-
-    def __init__(self, pinned: PinnedOutputs) -> None:
-        self.pinned, system = pinned, pinned.system
-        examined = np.abs(pinned.structure.states).max(axis=0)
-        self.sizes = np.maximum(examined, system.spread_around(system.nominal_state))
-        # The rates of states with a constant rate, such as clocks.
-        explicit, self._clocks = system.explicit, np.zeros(system.num_states)
-        inputs = ca.horzcat(explicit.g, explicit.h)
-        for i in range(system.num_states):
-            if not inputs[i, :].nnz() and explicit.f[i].is_constant():
-                self._clocks[i] = float(explicit.f[i])
-
-    def constant_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """Returns R with the outputs of a state and zero derivatives."""
-        layout, scale = self.pinned.layout, self.pinned.system.scale
-        reference = np.zeros(layout.reference_size)
-        chain = self.pinned.at(reference, parameters).residual(state)[-layout.chain_size :]
-        if layout.chain_size:
-            reference[layout.lowest[layout.dynamic]] = chain[layout.heads]
-        direct = layout.lowest[layout.direct]
-        if direct.size and not self._clocks.any():
-            pinned = self.pinned.at(reference, parameters)
-            still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
-            slopes, rate = pinned.slopes(state, still, by), pinned.rate(state)
-            if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
-                inverse = np.linalg.pinv(slopes / scale[:, None], DEPENDENT)
-                reference[direct] = -inverse @ (rate / scale)
-        return reference
-
-    def find(
-        self, pinned: PinnedSet, guess: FloatArray, regular: bool = True
-    ) -> tuple[FloatArray, int]:
-        """Returns a state at rest, by Newton's method for C(x) = 0 and T^T x' = 0 from a guess.
-
-        T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
-        shortest step is taken. Also returns the number of directions in which it is singular at the
-        state; none if it must be regular.
-        """
-        system, scale = self.pinned.system, self.pinned.system.scale
-        if self._clocks.any():
-            pairs = zip(system.state_signals, self._clocks, strict=True)
-            running = ", ".join(f"{signal.name}' = {rate:g}" for signal, rate in pairs if rate)
-            raise InconsistentStateError(
-                f"{system.name}: no state is an equilibrium, since {running} at all of "
-                "them, as for a clock: time must not be a state. Take it out of the state, as an "
-                "exogenous signal, or judge the zero dynamics along a motion",
-                self._clocks,
-            )
-
-        def linearize(z: FloatArray) -> NewtonModel | None:
-            gradients = pinned.gradients(scale * z) * scale
-            onto = shortest_steps(gradients, lambda z: pinned.residual(scale * z))
-            slopes = pinned.slopes(scale * z) * scale / scale[:, None]
-            if onto is None or not np.all(np.isfinite(slopes)):
-                return None
-            tangent = scipy.linalg.null_space(gradients)
-            along = tangent.T @ slopes @ tangent
-            size = np.linalg.norm(balanced_matrix(slopes)[0], 2)
-            noise = ROUND_OFF * float(size) / (np.linalg.norm(along) or 1.0)
-            inner = tangent @ np.linalg.pinv(along, noise) @ tangent.T
-
-            def step(z: FloatArray) -> FloatArray:
-                across = onto.step(z)
-                return across - inner @ (pinned.rate(scale * z) / scale + slopes @ across)
-
-            return NewtonModel(step, onto.is_regular)
-
-        z, converged = newton(pinned.state(guess) / scale, linearize)
-        point = pinned.point(scale * z)
-        unrest = self.unrest(pinned, point)
-        if not converged:
-            unrest = unrest or "the rates are small and do not vanish"
-        degenerate = 0 if unrest else self._degenerate(pinned, point.state)
-        if regular and degenerate:
-            unrest = "the Jacobian is singular"
-        if unrest:
-            raise InconsistentStateError(
-                f"{system.name}: {pinned.describe()} have no regular state at rest near the given "
-                f"one: the search ends at x = {show(point.state)}, where {unrest}",
-                point.rate,
-            )
-        return point.state, degenerate
-
-    def unrest(self, pinned: PinnedSet, point: PinnedPoint) -> str:
-        """Returns why a point is no regular state at rest, as text; empty if it is one."""
-        if point.flaw:
-            return point.flaw
-        slow = np.abs(point.rate) <= AT_REST * np.abs(pinned.slopes(point.state)) @ self.sizes
-        unrest = np.where(slow, 0.0, point.unrest)
-        worst = int(np.argmax(unrest))
-        if unrest[worst] <= AT_REST:
-            return ""
-        return f"{self.pinned.system.state_signals[worst].name}' = {point.rate[worst]:.3g}"
-
-    @np.errstate(all="ignore")  # The domain may end near the state.
-    def _degenerate(self, pinned: PinnedSet, state: FloatArray) -> int:
-        """The number of directions on Z(R) in which the Jacobian isolates no equilibrium."""
-        scale = self.pinned.system.scale
-        free, moved = coordinates(pinned.gradients(state), scale)
-
-        def slopes_at(x: FloatArray) -> FloatArray:
-            slopes = pinned.slopes(x) @ moved
-            return np.asarray(slopes[free] * scale[free] / scale[free][:, None])
-
-        slopes = slopes_at(state)
-        rate = (pinned.rate(state) / scale)[free]
-        if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate))):
-            return free.size
-        left, sizes, right = np.linalg.svd(slopes)
-        terms = np.abs(pinned.slopes(state)) @ np.abs(state)
-        rates = np.abs(left.T @ rate) + ROUNDED * np.abs(left.T) @ (terms / scale)[free]
-        count = 0
-        for u, size, v, rest in zip(left.T, sizes, right, rates, strict=True):
-            isolated = size > 0.0 and rest <= ISOLATED * size
-            if isolated:
-                along = moved @ (scale[free] * v)
-                along *= NEARBY / np.max(np.abs(along) / scale)
-                changes = [u @ (slopes_at(x) - slopes) @ v for x in (state + along, state - along)]
-                isolated = all(abs(change) <= SAME * size for change in changes)
-            count += not isolated
-        return count
 
 
 class _MotionLost(Exception):

@@ -213,22 +213,15 @@ def examine_structure(
     return structure, control_violation(structure)
 
 
-def constraint_structure_of(
-    owner: str, system: DaeSystem, structure: ConstraintStructure | None
-) -> ConstraintStructure:
-    """Returns the given structure of a system, or the result of `find_constraint_structure`."""
-    return structure_of(owner, system, structure, find_constraint_structure)
-
-
 def structure_of(
-    owner: str, system: DaeSystem, structure: Kind | None, find: Callable[[DaeSystem], Kind]
+    system: DaeSystem, structure: Kind | None, find: Callable[[DaeSystem], Kind]
 ) -> Kind:
-    """Returns the given structure of a system, or the one that is found."""
+    """Returns the given structure of a system, or what `find` finds."""
     if structure is None:
         return find(system)
     if structure.system is not system:
         raise ModelError(
-            f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
+            f"the structure is that of another system, '{structure.system.name}' and not "
             f"'{system.name}'. Omit it, or pass the structure of this system"
         )
     return structure
@@ -265,11 +258,8 @@ def check_system(system: DaeSystem) -> None:
     """Checks the number of constraints and the mass matrix of a system."""
     _check_positive_definite(system, "mass_matrix", system.nominal_state[None])
     if system.num_constraints > system.num_states:
-        raise Violation(2, ViolationKind.COUNT, _names(system)).error()
-
-
-def _names(system: DaeSystem) -> tuple[str, ...]:
-    return tuple(signal.name for signal in system.constraint_output_signals)
+        names = tuple(signal.name for signal in system.constraint_output_signals)
+        raise Violation(2, ViolationKind.COUNT, names).error()
 
 
 def _check_positive_definite(system: DaeSystem, key: str, states: FloatArray) -> None:
@@ -430,5 +420,5 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
     # A gradient that vanishes wherever its constraint holds does not depend on others.
     if not combinations or not all(combination.others for combination in combinations):
         return violation
-    names, redundant = _names(system), ViolationKind.REDUNDANT
-    return Violation(2, redundant, names, combinations=combinations, deciding=violation.deciding)
+    names, kind = tuple(s.name for s in system.constraint_output_signals), ViolationKind.REDUNDANT
+    return Violation(2, kind, names, combinations=combinations, deciding=violation.deciding)

@@ -74,7 +74,7 @@ class TrackingLaw:
         contact_stiffness: float | None = None,
         latency: float = 0.0,
     ) -> None:
-        self.structure = structure_of("TrackingLaw", system, structure, find_structure)
+        self.structure = structure_of(system, structure, find_structure)
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:
@@ -171,7 +171,9 @@ class TrackingLaw:
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
         """Checks gains, or designs them, for the outputs of this law."""
         names = tuple(signal.name for signal in self.system.output_signals)
-        return designed("gains", gains, names, self.integral.all_degrees)
+        more = [i in self.integral.outputs for i in range(len(names))]  # A pole each.
+        degrees = tuple(degree + own for degree, own in zip(self.degrees, more, strict=True))
+        return designed("gains", gains, names, degrees)
 
     def all_parameters(
         self, parameters: ArrayLike | None = None, gains: GainDesign | FeedbackGains | None = None

@@ -8,23 +8,32 @@ on the choice of xi in (22).
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Protocol
+from typing import Any
 
+import casadi as ca
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive, show, vector
-from drake_dae.dae.pinned_motion import PinnedMotion, PinnedOutputs, PinnedSet, TimeFunction, follow
+from drake_dae.dae.manifold import coordinates
+from drake_dae.dae.pinned_motion import (
+    PinnedMotion,
+    PinnedOutputs,
+    PinnedPoint,
+    PinnedSet,
+    TimeFunction,
+    follow,
+)
 from drake_dae.dae.stability import (
-    AT_REST,
-    ISOLATED,
+    ROUNDED,
     ComplexArray,
-    Equilibria,
     PeriodicMotions,
     Stability,
     StabilityAlong,
     Verdict,
+    balanced_matrix,
     judge,
     linearized_eigenvalues,
     without_dynamics,
@@ -32,14 +41,13 @@ from drake_dae.dae.stability import (
 from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.numerics import DEPENDENT, ROUND_OFF, NewtonModel, newton, shortest_steps
 
-
-class Exogenous(Protocol):
-    """A `Reference` of an exogenous signal."""
-
-    @property
-    def size(self) -> int: ...
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]: ...
+AT_REST = 1e-8  # A state is at rest if the terms of E x' cancel to this, relative to their sizes.
+ISOLATED = 1e-6  # An equilibrium is known to this distance, relative to the scale of the states.
+# The distance, relative to the scale, within which the slopes must be nearly constant.
+NEARBY = 1e-5
+SAME = 0.5  # The allowed relative change of the slopes there: then Newton's method contracts.
 
 
 @checked(ModelError)
@@ -61,11 +69,18 @@ class ZeroDynamics:
     """
 
     def __init__(self, system: DaeSystem, *, structure: Structure | None = None) -> None:
-        self.structure = structure = structure_of("ZeroDynamics", system, structure, find_structure)
+        self.structure = structure = structure_of(system, structure, find_structure)
         self.system = system
         self.dimension = structure.zero_dynamics_dimension
         self._pinned = PinnedOutputs(structure)
-        self._equilibria = Equilibria(self._pinned)
+        examined = np.abs(structure.states).max(axis=0)
+        self._sizes = np.maximum(examined, system.spread_around(system.nominal_state))
+        # The rates of states with a constant rate, such as clocks.
+        explicit, self._clocks = system.explicit, np.zeros(system.num_states)
+        inputs = ca.horzcat(explicit.g, explicit.h)
+        for i in range(system.num_states):
+            if not inputs[i, :].nnz() and explicit.f[i].is_constant():
+                self._clocks[i] = float(explicit.f[i])
         self.residual_signals = self._pinned.residual_signals
 
     def __repr__(self) -> str:
@@ -84,7 +99,7 @@ class ZeroDynamics:
             InconsistentStateError: Newton's method does not reach Z(R) from there.
         """
         goal = self._vector("reference", reference, self._pinned.layout.reference_size)
-        pinned = self._pinned.at(goal, self.system.parameter_vector(parameters))
+        pinned = PinnedSet(self._pinned, goal, self.system.parameter_vector(parameters))
         return pinned.state(self._guess(guess))
 
     @checked(ModelError)
@@ -94,7 +109,7 @@ class ZeroDynamics:
         times: ArrayLike,
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
-        exogenous: Sequence[Exogenous] = (),
+        exogenous: Sequence[Any] = (),
     ) -> PinnedMotion:
         """Computes the motion on Z(R(t)) from a state close to the guess, until it ends.
 
@@ -135,7 +150,7 @@ class ZeroDynamics:
                 states, but no equilibrium: `residual` is then x', shape (n,).
         """
         start, p = self._guess(guess), self.system.parameter_vector(parameters)
-        return self._equilibria.find(self._resting(start, outputs, p), start)[0]
+        return self._at_rest(self._resting(start, outputs, p), start)[0]
 
     @checked(ModelError)
     def eigenvalues(
@@ -157,7 +172,7 @@ class ZeroDynamics:
         x, p = self._guess(state), self.system.parameter_vector(parameters)
         pinned = self._resting(x, outputs, p)
         onto, _ = pinned.project(x)
-        unrest = self._equilibria.unrest(pinned, pinned.point(x))
+        unrest = self._unrest(pinned, pinned.point(x))
         off = np.any(np.abs(onto - x) > AT_REST * np.maximum(self.system.scale, np.abs(x)))
         if off or unrest:
             reason = "it is off N*, or its outputs change" if off else unrest
@@ -165,7 +180,7 @@ class ZeroDynamics:
                 f"{self.system.name}: x = {show(x)} is no regular equilibrium: {reason}. "
                 "Eigenvalues belong to an equilibrium; 'equilibrium' finds one"
             )
-        return linearized_eigenvalues(pinned, self._equilibria.sizes, x)[0]
+        return linearized_eigenvalues(pinned, self._sizes, x)[0]
 
     @checked(ModelError)
     def stability(
@@ -190,10 +205,10 @@ class ZeroDynamics:
         start = self.structure.manifold.project(self._guess(state), p)
         pinned = self._resting(start, outputs, p)
         try:
-            rest, degenerate = self._equilibria.find(pinned, start, regular=False)
+            rest, degenerate = self._at_rest(pinned, start, regular=False)
         except InconsistentStateError as error:
             return Stability(Verdict.UNDECIDED, str(error))
-        values, errors = linearized_eigenvalues(pinned, self._equilibria.sizes, rest)
+        values, errors = linearized_eigenvalues(pinned, self._sizes, rest)
         where = "at rest" if degenerate else "at the equilibrium"
         return judge(values, errors, rest, f"{where} with {pinned.describe()}", degenerate)
 
@@ -216,10 +231,10 @@ class ZeroDynamics:
         distinct = np.zeros((0, self.system.num_states))
         for start in starts:
             try:
-                rest, _ = self._equilibria.find(pinned, start)
+                rest, _ = self._at_rest(pinned, start)
             except InconsistentStateError:
                 continue
-            sizes = np.maximum(self._equilibria.sizes, np.abs(rest))
+            sizes = np.maximum(self._sizes, np.abs(rest))
             if not np.any(np.all(np.abs(distinct - rest) <= ISOLATED * sizes, axis=1)):
                 distinct = np.vstack([distinct, rest])
         return distinct
@@ -231,7 +246,7 @@ class ZeroDynamics:
         motion: PinnedMotion,
         period: float,
         parameters: ArrayLike | None = None,
-        exogenous: Sequence[Exogenous] = (),
+        exogenous: Sequence[Any] = (),
     ) -> StabilityAlong:
         """Judges by Floquet multipliers whether Assumption 2.2 holds along a periodic reference.
 
@@ -253,10 +268,10 @@ class ZeroDynamics:
             return StabilityAlong(at_rest.verdict, at_rest.reason, period)
         p = self.system.parameter_vector(parameters)
         at = partial(self._pinned.at_time, reference, self._moving(p, exogenous))
-        return PeriodicMotions(at, self._equilibria.sizes, period).judge(motion)
+        return PeriodicMotions(at, self._sizes, period).judge(motion)
 
     def _moving(
-        self, parameters: FloatArray, exogenous: Sequence[Exogenous]
+        self, parameters: FloatArray, exogenous: Sequence[Any]
     ) -> Callable[[float], FloatArray]:
         """Returns the function t -> values of all parameters."""
         if not exogenous:
@@ -297,9 +312,113 @@ class ZeroDynamics:
         self, state: FloatArray, outputs: ArrayLike | None, parameters: FloatArray
     ) -> PinnedSet:
         """Returns Z(R) with constant outputs; with those of the state if None."""
-        if outputs is None:
-            goal = self._equilibria.constant_outputs(state, parameters)
-        else:
-            values = self._vector("outputs", outputs, self.system.num_outputs)
-            goal = self._pinned.layout.constant(values)
-        return self._pinned.at(goal, parameters)
+        layout, scale = self._pinned.layout, self.system.scale
+        if outputs is not None:
+            goal = layout.constant(self._vector("outputs", outputs, self.system.num_outputs))
+            return PinnedSet(self._pinned, goal, parameters)
+        reference = np.zeros(layout.reference_size)
+        pinned = PinnedSet(self._pinned, reference, parameters)
+        if layout.chain_size:
+            chain = pinned.residual(state)[-layout.chain_size :]
+            reference[layout.lowest[layout.dynamic]] = chain[layout.heads]
+        direct = layout.lowest[layout.direct]
+        if direct.size and not self._clocks.any():
+            still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
+            slopes, rate = pinned.slopes(state, still, by), pinned.rate(state)
+            if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
+                inverse = np.linalg.pinv(slopes / scale[:, None], DEPENDENT)
+                reference[direct] = -inverse @ (rate / scale)
+        return pinned
+
+    def _at_rest(
+        self, pinned: PinnedSet, guess: FloatArray, regular: bool = True
+    ) -> tuple[FloatArray, int]:
+        """Returns a state at rest, by Newton's method for C(x) = 0 and T^T x' = 0 from a guess.
+
+        T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
+        shortest step is taken. Also returns the number of directions in which it is singular at the
+        state; none if it must be regular.
+        """
+        system, scale = self.system, self.system.scale
+        if self._clocks.any():
+            pairs = zip(system.state_signals, self._clocks, strict=True)
+            running = ", ".join(f"{signal.name}' = {rate:g}" for signal, rate in pairs if rate)
+            raise InconsistentStateError(
+                f"{system.name}: no state is an equilibrium, since {running} at all of "
+                "them, as for a clock: time must not be a state. Take it out of the state, as an "
+                "exogenous signal, or judge the zero dynamics along a motion",
+                self._clocks,
+            )
+
+        def linearize(z: FloatArray) -> NewtonModel | None:
+            gradients = pinned.gradients(scale * z) * scale
+            onto = shortest_steps(gradients, lambda z: pinned.residual(scale * z))
+            slopes = pinned.slopes(scale * z) * scale / scale[:, None]
+            if onto is None or not np.all(np.isfinite(slopes)):
+                return None
+            basis = scipy.linalg.null_space(gradients)
+            along = basis.T @ slopes @ basis
+            size = np.linalg.norm(balanced_matrix(slopes)[0], 2)
+            noise = ROUND_OFF * float(size) / (np.linalg.norm(along) or 1.0)
+            inner = basis @ np.linalg.pinv(along, noise) @ basis.T
+
+            def step(z: FloatArray) -> FloatArray:
+                across = onto.step(z)
+                return across - inner @ (pinned.rate(scale * z) / scale + slopes @ across)
+
+            return NewtonModel(step, onto.is_regular)
+
+        z, converged = newton(pinned.state(guess) / scale, linearize)
+        point = pinned.point(scale * z)
+        unrest = self._unrest(pinned, point)
+        if not converged:
+            unrest = unrest or "the rates are small and do not vanish"
+        degenerate = 0 if unrest else self._degenerate(pinned, point.state)
+        if regular and degenerate:
+            unrest = "the Jacobian is singular"
+        if unrest:
+            raise InconsistentStateError(
+                f"{system.name}: {pinned.describe()} have no regular state at rest near the given "
+                f"one: the search ends at x = {show(point.state)}, where {unrest}",
+                point.rate,
+            )
+        return point.state, degenerate
+
+    def _unrest(self, pinned: PinnedSet, point: PinnedPoint) -> str:
+        """Returns why a point is no regular state at rest, as text; empty if it is one."""
+        if point.flaw:
+            return point.flaw
+        slow = np.abs(point.rate) <= AT_REST * np.abs(pinned.slopes(point.state)) @ self._sizes
+        unrest = np.where(slow, 0.0, point.unrest)
+        worst = int(np.argmax(unrest))
+        if unrest[worst] <= AT_REST:
+            return ""
+        return f"{self.system.state_signals[worst].name}' = {point.rate[worst]:.3g}"
+
+    @np.errstate(all="ignore")  # The domain may end near the state.
+    def _degenerate(self, pinned: PinnedSet, state: FloatArray) -> int:
+        """The number of directions on Z(R) in which the Jacobian isolates no equilibrium."""
+        scale = self.system.scale
+        free, moved = coordinates(pinned.gradients(state), scale)
+
+        def slopes_at(x: FloatArray) -> FloatArray:
+            slopes = pinned.slopes(x) @ moved
+            return np.asarray(slopes[free] * scale[free] / scale[free][:, None])
+
+        slopes = slopes_at(state)
+        rate = (pinned.rate(state) / scale)[free]
+        if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate))):
+            return free.size
+        left, sizes, right = np.linalg.svd(slopes)
+        terms = np.abs(pinned.slopes(state)) @ np.abs(state)
+        rates = np.abs(left.T @ rate) + ROUNDED * np.abs(left.T) @ (terms / scale)[free]
+        count = 0
+        for u, size, v, rest in zip(left.T, sizes, right, rates, strict=True):
+            isolated = size > 0.0 and rest <= ISOLATED * size
+            if isolated:
+                along = moved @ (scale[free] * v)
+                along *= NEARBY / np.max(np.abs(along) / scale)
+                changes = [u @ (slopes_at(x) - slopes) @ v for x in (state + along, state - along)]
+                isolated = all(abs(change) <= SAME * size for change in changes)
+            count += not isolated
+        return count

@@ -42,7 +42,7 @@ from drake_dae.scene.view import add_live_view
 from drake_dae.systems.applied_control import ControlHold, ControlLimits
 from drake_dae.systems.controller import Controller, PhaseChange, TrackingController, check_law
 from drake_dae.systems.estimator import StateEstimator
-from drake_dae.systems.plant import Plant
+from drake_dae.systems.plant import Plant, port_signals
 from drake_dae.systems.references import CommandedReferences, ReferenceGenerator
 from drake_dae.systems.sensors import ForceSensor, StateSensor
 
@@ -242,7 +242,10 @@ def wire_loop(
     named = Named()
 
     def connect(source: OutputPort, system: System, port: str) -> None:
-        builder.Connect(source, system.GetInputPort(port))
+        try:
+            builder.Connect(source, system.GetInputPort(port))
+        except RuntimeError as error:  # Drake names both systems and their sizes.
+            raise WiringError(str(error)) from None
 
     # The plant, its references and its controller.
     for block in (plant, reference, controller):
@@ -334,7 +337,8 @@ def wire_loop(
     if moving is not None:
         signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         inputs["exogenous"] = (moving.get_output_port(), signals)
-    inputs |= {name: (plant.GetOutputPort(name), s) for name, s in plant.port_signals.items()}
+    own = port_signals(plant.structure)
+    inputs |= {name: (plant.GetOutputPort(name), s) for name, s in own.items()}
     if reference is not None:
         inputs["reference"] = (goal, controller.law.reference_signals)
     named = {**inputs, "control": (control, dae.control_signals), **named}
@@ -354,7 +358,10 @@ def wire_loop(
         source = moving.get_output_port() if moving is not None else None
         add_live_view(builder, plant, scene_graph, meshcat, source)
 
-    diagram = builder.Build()
+    try:
+        diagram = builder.Build()
+    except RuntimeError as error:  # An algebraic loop, or a block of another diagram, by name.
+        raise WiringError(str(error)) from None
     diagram.set_name("closed_loop")
     return ClosedLoop(
         diagram,

@@ -19,8 +19,13 @@ from drake_dae.errors import ModelError
 from drake_dae.pictures.motion import follow, run_points, run_view
 from drake_dae.robots import axes_along
 from drake_dae.scene.arrows import FORCE_COLOR, LEAST_SCALE, MOMENT_COLOR, PATH_COLOR, path_of
-from drake_dae.scene.camera import view_angles
-from drake_dae.scene.surroundings import diagonal, floor_below, scene_points, surroundings
+from drake_dae.scene.surroundings import (
+    diagonal,
+    floor_below,
+    scene_points,
+    surroundings,
+    view_angles,
+)
 from drake_dae.scene.view import (
     ARROW,
     ASPECT,

@@ -42,8 +42,7 @@ from drake_dae.diagrams.record import Record, phases_at
 from drake_dae.errors import ModelError
 from drake_dae.pictures.motion import RunMotion, follow, run_points, run_view
 from drake_dae.robots import own_values
-from drake_dae.scene.camera import view_angles
-from drake_dae.scene.surroundings import diagonal, floor_below, surroundings
+from drake_dae.scene.surroundings import diagonal, floor_below, surroundings, view_angles
 from drake_dae.scene.view import ARROW, PIECE
 
 _RATE, _STRIP = 10, 4  # Pictures per second of a .gif; pictures in a .png.

@@ -14,8 +14,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import InconsistentStateError
 from drake_dae.robots import ConstraintWrenches, RobotModel, Wrenches, own_values, tangents
-from drake_dae.scene.camera import direction_of, framed
-from drake_dae.scene.surroundings import scene_points
+from drake_dae.scene.surroundings import direction_of, framed, scene_points
 from drake_dae.scene.view import FRAME_RATE
 
 # A path on a surface is omitted if its extent is below this fraction of the largest coordinate of

@@ -251,8 +251,8 @@ class ConstraintSet:
             frames = ", ".join(dict.fromkeys(f for a in acting for f in (a.frame_a, a.frame_b)))
             where = "at several points of" if on_frame else "not on"
             raise ModelError(
-                f"constraint '{name}' acts {where} '{frame}', and exactly one point on it is "
-                f"needed; it acts on {frames or 'no known frame'}"
+                f"constraint '{name}' acts {where} '{frame}', where one point is needed; it acts "
+                f"on {frames or 'no known frame'}"
             )
         sign = 1.0 if frame == on_frame[0].frame_b else -1.0
         return on_frame[0].point, sign * on_frame[0].force(constraint_force[part])

@@ -54,12 +54,11 @@ class Application:
     moment_axes: ca.SX  # N m for a unit of each lambda, shape (3, m).
     frame_b: str
     frame_a: str = "world"
-    drag: ca.SX | None = None  # The part of F without constraint forces, N, shape (3, 1).
+    drag: ca.SX = field(default_factory=lambda: ca.SX(3, 1))  # N, shape (3, 1).
 
     def force(self, constraint_force: ca.SX) -> ca.SX:
         """F in N, shape (3, 1), for constraint forces of shape (m, 1)."""
-        force = ca.mtimes(self.force_axes, constraint_force)
-        return force if self.drag is None else force + self.drag
+        return ca.mtimes(self.force_axes, constraint_force) + self.drag
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +86,7 @@ class Reaction:
 
 
 class Kinematics(Frames):
-    """The frames of a robot in motion, in which constraints are expressed.
+    """The frames of a robot in motion: by default the poses of its links, differentiated directly.
 
     1. Its expressions contain q, v, the robot's parameters, and symbols of its own for poses and
        velocities of frames; `value` replaces these by their expressions.
@@ -102,28 +101,45 @@ class Kinematics(Frames):
        joint has several positions, or if it is not known.
     """
 
-    v: ca.SX  # Generalized velocities, shape (nv, 1).
-    acceleration: ca.SX  # v', shape (nv, 1).
+    def __init__(self, links: "Links", acceleration: ca.SX | None) -> None:
+        if acceleration is None:
+            acceleration = ca.SX.sym("acceleration", links.v.numel())
+        self.q, self.v, self.acceleration = links.q, links.v, acceleration
+        self.position_signals, self._links = links.position_signals, links
 
-    @abstractmethod
+    def rotation(self, frame: Any) -> ca.SX:
+        return self._links.rotation(frame)
+
+    def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
+        return self._links.position(frame, point)
+
     def angular_velocity(self, frame: Any) -> ca.SX:
         """w in rad/s, shape (3, 1): the angular velocity of a frame, in the world."""
+        rotation = self.rotation(frame)
+        rate = ca.reshape(self.derivative(ca.vec(rotation)), 3, 3)
+        # R' = w x R, so that R' R^T contains w.
+        return ca.vertcat(
+            ca.mtimes(rate[2, :], rotation[1, :].T),
+            ca.mtimes(rate[0, :], rotation[2, :].T),
+            ca.mtimes(rate[1, :], rotation[0, :].T),
+        )
 
-    @abstractmethod
     def velocity(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
         """p_W' in m/s, shape (3, 1): the velocity of a point that is fixed in a frame."""
+        return self.derivative(self.position(frame, point))
 
-    @abstractmethod
     def derivative(self, expression: ca.SX) -> ca.SX:
         """The time derivative of an expression of positions and velocities, shape (k, 1)."""
+        rate = ca.vertcat(ca.mtimes(self._links.velocity_map, self.v), self.acceleration)
+        return ca.jtimes(expression, ca.vertcat(self.q, self.v), rate)
 
-    @abstractmethod
     def reaction(self, power: ca.SX) -> Reaction:
         """The forces on the links with a power in W that is linear in velocities."""
+        return Reaction(ca.gradient(power, self.v))
 
-    @abstractmethod
     def value(self, expression: ca.SX) -> ca.SX:
         """The expression in terms of q, v, `acceleration` and parameters alone."""
+        return expression
 
     def joint_axis(self, position: str) -> Application | None:
         """The action of the joint of a position, by its name, on the child and the parent."""
@@ -187,9 +203,9 @@ class Links(Frames):
         frames = dict.fromkeys(outline.frame for outline in self.outlines)
         return ca.horzcat(*[self.position(frame) for frame in frames])
 
-    @abstractmethod
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
         """The frames in motion with v' = `acceleration`, a symbol of its own if None."""
+        return Kinematics(self, acceleration)
 
     def generalized_force(self, kinematics: Any, reaction: Reaction) -> ca.SX:
         """tau of each column of a reaction in kinematics of these links, shape (nv, k)."""
@@ -318,46 +334,3 @@ class LinkExpressions(Links):
         offset, pose = numbers("point", point), self._pose(frame)
         origin = pose[1] if isinstance(pose, tuple) else pose
         return origin + ca.mtimes(self.rotation(frame), offset) if offset.any() else origin
-
-    def kinematics(self, acceleration: ca.SX | None = None) -> "TextbookKinematics":
-        return TextbookKinematics(self, acceleration)
-
-
-class TextbookKinematics(Kinematics):
-    """Frames whose poses are expressions of q and are differentiated directly."""
-
-    def __init__(self, links: LinkExpressions, acceleration: ca.SX | None) -> None:
-        if acceleration is None:
-            acceleration = ca.SX.sym("acceleration", links.v.numel())
-        self.q, self.v, self.acceleration = links.q, links.v, acceleration
-        self.position_signals, self._links = links.position_signals, links
-        self._moving = ca.vertcat(links.q, links.v)
-        self._rate = ca.vertcat(ca.mtimes(links.velocity_map, links.v), acceleration)
-
-    def rotation(self, frame: str) -> ca.SX:
-        return self._links.rotation(frame)
-
-    def position(self, frame: str, point: ArrayLike = ORIGIN) -> ca.SX:
-        return self._links.position(frame, point)
-
-    def angular_velocity(self, frame: str) -> ca.SX:
-        rotation = self._links.rotation(frame)
-        rate = ca.reshape(self.derivative(ca.vec(rotation)), 3, 3)
-        # R' = w x R, so that R' R^T contains w.
-        return ca.vertcat(
-            ca.mtimes(rate[2, :], rotation[1, :].T),
-            ca.mtimes(rate[0, :], rotation[2, :].T),
-            ca.mtimes(rate[1, :], rotation[0, :].T),
-        )
-
-    def velocity(self, frame: str, point: ArrayLike = ORIGIN) -> ca.SX:
-        return self.derivative(self.position(frame, point))
-
-    def derivative(self, expression: ca.SX) -> ca.SX:
-        return ca.jtimes(expression, self._moving, self._rate)
-
-    def reaction(self, power: ca.SX) -> Reaction:
-        return Reaction(ca.gradient(power, self.v))
-
-    def value(self, expression: ca.SX) -> ca.SX:
-        return expression

@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.math import RollPitchYaw
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import brief
+from drake_dae.arrays import brief, positive
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint import Constraint, ConstraintSet
@@ -79,13 +79,9 @@ class LoopJoint(Constraint):
     coordinate: ClassVar[str]  # The name of c.
 
     def __post_init__(self) -> None:
-        for key in ("damping", "stiffness"):
-            if getattr(self, key) < 0.0:
-                raise ModelError(f"{key} must not be negative, got {getattr(self, key):g}")
         for key in ("velocity_limit", "effort_limit"):
-            value = getattr(self, key)
-            if value is not None and not value > 0.0:
-                raise ModelError(f"{key} must be positive, got {value:g}; leave it out if unknown")
+            if (value := getattr(self, key)) is not None:
+                positive(key, value)
         if self.effort_limit is not None and not self.motor:
             raise ModelError("effort_limit is that of a motor; say motor=True")
         low, high = self.limits
@@ -98,7 +94,7 @@ class LoopJoint(Constraint):
         unit, force = self.units
         made = {"damping": f"{force} s/{unit}", "stiffness": f"{force}/{unit}"}
         return tuple(
-            Parameter(f"{self.name}.{key}", np.array([getattr(self, key)]), per)
+            Parameter(f"{self.name}.{key}", np.array([getattr(self, key)]), per, nonnegative=True)
             for key, per in made.items()
             if getattr(self, key)
         )

@@ -118,7 +118,14 @@ class RobotModel:
         signals += [signal for force in self.forces for signal in force.signals(bound)]
         equations = self._equations(bound, driven, h_1, S, tuple(signals), choice, nominal)
         self.dae = replace(equations, compiled=compiled).with_exogenous(exogenous)
-        self._check_exogenous()
+        moving = {p.name for p in self.dae.exogenous.moving}
+        for constraint in self.constraints:
+            names = [p.name for p in constraint.parameters if p.name in moving]
+            if names and constraint.residual(links).numel() < len(constraint.force_signals):
+                raise ModelError(  # Its rate would be incomplete.
+                    f"{name}: '{names[0]}' cannot move, since '{constraint.name}' restricts "
+                    "velocities"
+                )
         if compliances is not None:
             self.dae = share_forces(self.dae, compliances=compliances)
         self._check_mass_matrix(nominal)
@@ -227,13 +234,9 @@ class RobotModel:
 
     def __repr__(self) -> str:
         constraints = listed(constraint.name for constraint in self.constraints)
-        stages = listed(type(stage).__name__ for stage in self.stages) if self.stages else ""
-        return (
-            f"RobotModel('{self.name}', positions={self.links.q.numel()}, "
-            f"constraints={constraints}, "
-            + (f"actuation={stages}, " if stages else "")
-            + f"outputs={listed(signal.name for signal in self.dae.output_signals)})"
-        )
+        outputs = listed(signal.name for signal in self.dae.output_signals)
+        count = f"positions={self.links.q.numel()}"
+        return f"RobotModel('{self.name}', {count}, constraints={constraints}, outputs={outputs})"
 
     @property
     def position_signals(self) -> tuple[Signal, ...]:
@@ -280,21 +283,9 @@ class RobotModel:
         Raises:
             ModelError: No drive holds the robot there.
         """
-        return self.balance.state(*self._at_rest(positions, forces, parameters))
-
-    @checked(ModelError)
-    def rest_forces(
-        self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
-    ) -> FloatArray:
-        """lambda, shape (m,), at rest with S lambda = z_2; arguments as of `rest_state`."""
-        return self.balance.rest(*self._at_rest(positions, forces, parameters))[1]
-
-    def _at_rest(
-        self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
         load = vector(f"{self.name}: forces", forces, self._num_forces)
-        return q, load, self.dae.parameter_vector(parameters)
+        return self.balance.state(q, load, self.dae.parameter_vector(parameters))
 
     def _check_outputs(
         self, motors: Sequence[Signal], positions: Sequence[Signal], is_chosen: bool
@@ -348,18 +339,6 @@ class RobotModel:
                 f"smallest eigenvalue {smallest:.2g}. A link without inertia cannot be moved by a "
                 "force; give it mass, or weld it"
             )
-
-    def _check_exogenous(self) -> None:
-        """Refuses exogenous parameters of nonholonomic constraints: their rate is incomplete."""
-        moving = {p.name for p in self.dae.exogenous.moving}
-        for constraint in self.constraints:
-            names = [p.name for p in constraint.parameters if p.name in moving]
-            rows = constraint.residual(self.links).numel()
-            if names and rows < len(constraint.force_signals):
-                raise ModelError(
-                    f"{self.name}: '{names[0]}' cannot move, since '{constraint.name}' restricts "
-                    "velocities"
-                )
 
     def _on_constraints(self, default: FloatArray) -> FloatArray:
         """The default configuration, or a random one if none on the constraints is near it."""

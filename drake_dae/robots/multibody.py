@@ -251,7 +251,6 @@ class MultibodyExpressions(Links):
                 )
         damping = np.concatenate([joint.default_damping_vector() for joint in joints])
         force = -ca.SX(damping) * self.v
-        along: list[LinearSpringDamper] = []
         for i in range(self.plant.num_force_elements()):
             match element := self.plant.get_force_element(ForceElementIndex(i)):
                 case RevoluteSpring():
@@ -259,7 +258,13 @@ class MultibodyExpressions(Links):
                 case PrismaticSpring():
                     stiffness, rest = element.stiffness(), element.nominal_position()
                 case LinearSpringDamper():
-                    along.append(element)
+                    start = self.position(element.bodyA().body_frame(), element.p_AP())
+                    end = self.position(element.bodyB().body_frame(), element.p_BQ())
+                    length = length_of(end - start)
+                    gradient = ca.jacobian(length, self.q) @ self.velocity_map
+                    tension = element.stiffness() * (length - element.free_length())
+                    tension += element.damping() * (gradient @ self.v)
+                    force -= gradient.T @ tension
                     continue
                 case UniformGravityFieldElement():
                     continue
@@ -271,14 +276,6 @@ class MultibodyExpressions(Links):
                     )
             place = element.joint().position_start()
             force[place] += stiffness * (rest - self.q[place])
-        for spring in along:
-            start = self.position(spring.bodyA().body_frame(), spring.p_AP())
-            end = self.position(spring.bodyB().body_frame(), spring.p_BQ())
-            length = length_of(end - start)
-            gradient = ca.jacobian(length, self.q) @ self.velocity_map
-            tension = spring.stiffness() * (length - spring.free_length())
-            tension += spring.damping() * (gradient @ self.v)
-            force -= gradient.T @ tension
         self._spring_force = force
 
     @property
@@ -306,29 +303,21 @@ class MultibodyExpressions(Links):
             mass = plant.CalcMassMatrix(context)
             rates = plant.MapVelocityToQDot(context, state[1])
             theirs = mass, plant.CalcBiasTerm(context) - applied, rates
-            if not np.abs(mass).max() > 0.0:
+            if not (np.abs(mass).max() > 0.0 and all(np.isfinite(t).all() for t in theirs)):
                 raise ModelError(
-                    "no link that moves has mass or inertia; give each of them an <inertial>, or "
-                    "weld it to one that has"
+                    "the plant's own mass matrix is zero or not finite: no mass or inertia moves "
+                    "with a joint; give each moving link an <inertial>, or weld it to one that has"
                 )
             # Forces that cancel have no scale of their own.
             scales = np.abs(mass).max(), np.abs(mass).max(), 1.0
             own = function(*state, values)
             for name, one, other, scale in zip(names, own, theirs, scales, strict=True):
-                one = one.reshape(other.shape)
-                if not np.all(np.isfinite(other)):
+                apart = np.abs(one.reshape(other.shape) - other).max()
+                if not (error := apart / max(np.abs(other).max(), scale)) <= TOLERANCE:
                     raise ModelError(
-                        f"the plant's own {name} is not finite at q = {state[0]}: a joint has no "
-                        "mass to move; give each moving link mass and inertia, or weld it"
-                    )
-                error = np.abs(one - other) / max(np.abs(other).max(), scale)
-                if not error.max() <= TOLERANCE:
-                    place = np.unravel_index(np.argmax(error), error.shape)
-                    raise ModelError(
-                        f"{name} differs from the plant's own by {error.max():.1e} (relative): "
-                        f"entry {[int(i) for i in place]} is {one[place]:g}, the plant's "
-                        f"{other[place]:g}, at q = {state[0]}, v = {state[1]}; this is an error in "
-                        "drake_dae, please report the model"
+                        f"{name} differs from the plant's own by {error:.1e} (relative) at q = "
+                        f"{state[0]}, v = {state[1]}; this is an error in drake_dae, please report "
+                        "the model"
                     )
 
 
@@ -350,11 +339,12 @@ class TreeKinematics(Kinematics):
     fewer operations than derivatives through the joints.
     """
 
+    _links: MultibodyExpressions
+
     def __init__(
         self, links: MultibodyExpressions, acceleration: ca.SX, moving: Sequence[LinkMotion]
     ) -> None:
-        self.q, self.v, self.acceleration = links.q, links.v, acceleration
-        self.position_signals = links.position_signals
+        super().__init__(links, acceleration)
         self.moving, self._links = moving, links
         self._symbols: dict[int, tuple[Frame, _FrameSymbols]] = {}
 

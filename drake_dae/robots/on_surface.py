@@ -79,18 +79,17 @@ class PointOnSurface(Constraint):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        def number(key: str, value: float, unit: str = "", positive: bool = False) -> Parameter:
-            name, given = f"{self.name}.{key}", np.array([value])
-            return Parameter(name, given, unit, positive, nonnegative=not positive)
-
-        made = [Parameter(f"{self.name}.position", np.array(self.surface.position), "m")]
+        name = self.name
+        made = [Parameter(f"{name}.position", np.array(self.surface.position), "m")]
         if self.rpy is not None:
-            made.append(Parameter(f"{self.name}.rpy", np.array(self.rpy), "rad"))
-        if self.friction is not None:
-            made.append(number("friction", self.friction))
-            made.append(number("stiction_tolerance", self.stiction_tolerance, "m/s", True))
-        if self.viscous_friction is not None:
-            made.append(number("viscous_friction", self.viscous_friction, "N s/m"))
+            made.append(Parameter(f"{name}.rpy", np.array(self.rpy), "rad"))
+        if (mu := self.friction) is not None:
+            slow = np.array([self.stiction_tolerance])
+            made.append(Parameter(f"{name}.friction", np.array([mu]), nonnegative=True))
+            made.append(Parameter(f"{name}.stiction_tolerance", slow, "m/s", positive=True))
+        if (d := self.viscous_friction) is not None:
+            drag = Parameter(f"{name}.viscous_friction", np.array([d]), "N s/m", nonnegative=True)
+            made.append(drag)
         return (*made, *self._form[1])
 
     @cached_property
@@ -117,11 +116,10 @@ class PointOnSurface(Constraint):
         return ca.SX.eye(3) if self.rpy is None else rotation_of(self.parameters[1].symbol)
 
     def offset(self, frames: Frames) -> ca.SX:
-        """The point relative to the surface, in its axes, m, shape (3, 1)."""
         return self.offset_of(frames.position(self.frame, self.point))
 
     def offset_of(self, point: ca.SX) -> ca.SX:
-        """The same of any point in the world, shape (3, 1)."""
+        """A point in the world relative to the surface, in its axes, m, shape (3, 1)."""
         offset = point - self.parameters[0].symbol
         return offset if self.rpy is None else ca.mtimes(self.rotation.T, offset)
 
@@ -153,37 +151,31 @@ class PointOnSurface(Constraint):
         normal = self.normal(kinematics)
         return velocity - normal * ca.dot(normal, velocity)
 
-    def _pull(self, kinematics: Kinematics) -> ca.SX | None:
-        """-mu s, the friction force for a unit of the normal force, shape (3, 1)."""
-        sliding = self.sliding(kinematics)
-        if sliding is None or self.friction is None:
-            return None
-        speed = ca.sqrt(ca.sumsqr(sliding) + self.symbol("stiction_tolerance") ** 2)
-        return -self.symbol("friction") * (sliding / speed)
-
-    def _drag(self, kinematics: Kinematics) -> ca.SX | None:
-        """-d v_t in N, shape (3, 1)."""
-        sliding = self.sliding(kinematics)
-        if sliding is None or self.viscous_friction is None:
-            return None
-        return -self.symbol("viscous_friction") * sliding
+    def _rubbing(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX]:
+        """-mu s, for a unit of the normal force, and -d v_t in N, shapes (3, 1)."""
+        sliding, pull, drag = self.sliding(kinematics), ca.SX(3, 1), ca.SX(3, 1)
+        if sliding is not None and self.friction is not None:
+            speed = ca.sqrt(ca.sumsqr(sliding) + self.symbol("stiction_tolerance") ** 2)
+            pull = -self.symbol("friction") * (sliding / speed)
+        if sliding is not None and self.viscous_friction is not None:
+            drag = -self.symbol("viscous_friction") * sliding
+        return pull, drag
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
-        pushed, pull = super().reaction(kinematics, constraint_force), self._pull(kinematics)
-        if pull is None:
+        pushed = super().reaction(kinematics, constraint_force)
+        if self.friction is None:
             return pushed
-        return pushed + kinematics.push(self.frame, pull * constraint_force, self.point)
+        pull = self._rubbing(kinematics)[0] * constraint_force
+        return pushed + kinematics.push(self.frame, pull, self.point)
 
     def drag(self, kinematics: Kinematics) -> Reaction:
-        drag = self._drag(kinematics)
-        if drag is None:
+        if self.viscous_friction is None:
             return super().drag(kinematics)
-        return kinematics.push(self.frame, drag, self.point)
+        return kinematics.push(self.frame, self._rubbing(kinematics)[1], self.point)
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        push, pull = self.normal(kinematics), self._pull(kinematics)
-        push = push if pull is None else push + pull
-        point, drag = kinematics.position(self.frame, self.point), self._drag(kinematics)
+        pull, drag = self._rubbing(kinematics)
+        push, point = self.normal(kinematics) + pull, kinematics.position(self.frame, self.point)
         return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
 
     def touch(self, frames: Frames) -> Touch:
@@ -290,9 +282,6 @@ class FrictionCone:
         normal: The name of the normal force, a constraint force that is positive in contact.
         tangents: The names of one or two tangential forces.
         limit: The largest ratio of the forces, positive: the coefficient of static friction.
-
-    Raises:
-        ModelError: The limit is not positive, or there are not one or two tangential forces.
     """
 
     normal: str

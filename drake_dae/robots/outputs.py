@@ -219,9 +219,7 @@ class ForceOutput(ABC):
     """
 
     @abstractmethod
-    def expression(
-        self, constraints: ConstraintSet, kinematics: Kinematics, constraint_force: ca.SX
-    ) -> ca.SX:
+    def expression(self, constraints: ConstraintSet, kinematics: Kinematics, force: ca.SX) -> ca.SX:
         """The components, shape (k, 1), written in the robot's kinematics and lambda."""
 
     @abstractmethod
@@ -246,10 +244,8 @@ class ForceCombination(ForceOutput):
         if not any(self.weights.values()):
             raise ModelError(f"'{self.name}' needs at least one weight that is not zero")
 
-    def expression(
-        self, constraints: ConstraintSet, kinematics: Kinematics, constraint_force: ca.SX
-    ) -> ca.SX:
-        parts = [w * constraint_force[constraints.place(n)] for n, w in self.weights.items()]
+    def expression(self, constraints: ConstraintSet, kinematics: Kinematics, force: ca.SX) -> ca.SX:
+        parts = [w * force[constraints.place(n)] for n, w in self.weights.items()]
         return ca.sum1(ca.vertcat(*parts))
 
     def signals(self, constraints: ConstraintSet) -> tuple[Signal, ...]:
@@ -295,11 +291,9 @@ class Squeeze(ForceOutput):
         if self.first == self.second:
             raise ModelError(f"a squeeze is between two constraints, both are '{self.first}'")
 
-    def expression(
-        self, constraints: ConstraintSet, kinematics: Kinematics, constraint_force: ca.SX
-    ) -> ca.SX:
+    def expression(self, constraints: ConstraintSet, kinematics: Kinematics, force: ca.SX) -> ca.SX:
         (p_i, f_i), (p_j, f_j) = (
-            constraints.force_on(self.frame, name, kinematics, constraint_force)
+            constraints.force_on(self.frame, name, kinematics, force)
             for name in (self.first, self.second)
         )
         apart = p_j - p_i

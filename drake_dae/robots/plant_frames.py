@@ -142,10 +142,8 @@ def check_joint(joint: Joint) -> None:
     if joint.is_ephemeral():
         raise ModelError(
             f"body '{joint.child_body().name()}' is free, so Finalize gave it a "
-            f"{joint.type_name()} joint. A quaternion is not supported: its length 1 is an "
-            "equation that no force keeps, so that J M^-1 J^T would be singular. Before Finalize, "
-            "weld it to the world (plant.WeldFrames) or add an RpyFloatingJoint from the world to "
-            "it, which has roll, pitch and yaw"
+            f"{joint.type_name()} joint, which is not supported. Before Finalize, weld it to the "
+            "world (plant.WeldFrames), or add an RpyFloatingJoint from the world to it"
         )
     names = ", ".join(supported.kTypeName for supported in SUPPORTED_JOINTS)
     raise ModelError(

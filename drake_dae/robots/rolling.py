@@ -159,8 +159,7 @@ class RollingBall(_RestingPoint):
     "<name>.position" and "<name>.radius" are the position of the surface and the radius.
 
     The surface must have an exact distance function, as planes, spheres, cylinders and tori do.
-    Check that friction can provide the rolling forces, which are on the port. For a sticking point
-    use `CoincidentPoints` with the world instead of a ball of radius zero.
+    Check that friction can provide the rolling forces.
 
     Attributes:
         frame: Name of a frame on the ball.

@@ -62,11 +62,9 @@ class StaticBalance:
     """
 
     def __init__(self, dae: DaeSystem, robot: Links, S: ca.SX) -> None:
-        q, v = robot.q, robot.v
-        links = q.numel() + v.numel()
+        q, v, links = robot.q, robot.v, robot.q.numel() + robot.v.numel()
+        force, load = ca.SX.sym("lambda", dae.num_constraints), ca.SX.sym("z_2", S.shape[0])
         control = ca.SX.sym("u", dae.num_controls)
-        force = ca.SX.sym("lambda", dae.num_constraints)
-        load = ca.SX.sym("z_2", S.shape[0])
         balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
         balance = ca.substitute(balance[q.numel() :], v, ca.SX.zeros(v.numel()))
         balance = ca.vertcat(balance, ca.mtimes(S, force) - load)
@@ -78,11 +76,7 @@ class StaticBalance:
         self._function = TracedFunction(
             f"{dae.name} equilibrium",
             {"q": q, "z_2": load, "s, u, lambda": unknown, "parameters": dae.parameter_symbol},
-            {
-                "balance": balance,
-                "gradient": ca.jacobian(balance, unknown),
-                "constraint_force": all_forces,
-            },
+            {"balance": balance, "gradient": ca.jacobian(balance, unknown), "lambda": all_forces},
         )
 
     def state(self, q: FloatArray, forces: FloatArray, parameters: FloatArray) -> FloatArray:

@@ -56,28 +56,6 @@ def mesh_of_grid(points: FloatArray) -> TriangleSurfaceMesh:
     return TriangleSurfaceMesh(triangles, list(flat[used]))
 
 
-def facets_needed(grid: FloatArray) -> tuple[int, int]:
-    """The numbers of facets along rows and columns of an even grid, from its curvature."""
-    _check_whole(grid)
-    counts = []
-    for axis in (0, 1):
-        bend = np.linalg.norm(np.diff(grid, 2, axis=axis), axis=-1).max() / 8.0
-        cells = (grid.shape[axis] - 1) * (bend / _SAG) ** 0.5
-        counts.append(int(np.clip(np.ceil(cells), _LEAST, _MOST)))
-    return counts[0], counts[1]
-
-
-def sides(facets: int, length: float, depth: float) -> FloatArray:
-    """Places along a side, from -1/2 to 1/2 of its length, shape (facets + 3,)."""
-    rim = _RIM * depth / length
-    if not rim < 0.25:
-        raise ModelError(
-            f"a piece of {length:.3g} m is too short for a layer of {depth:g} m, whose rims take "
-            f"{2 * _RIM * depth:.3g} m; use a smaller plant.thickness, or a larger plant.piece"
-        )
-    return np.concatenate([[-0.5], np.linspace(rim - 0.5, 0.5 - rim, facets + 1), [0.5]])
-
-
 def layer_below(grid: FloatArray, surface: TracedFunction, depth: float) -> PosedShape:
     """A layer of tetrahedra below the points of a grid, shape (r, c, 3).
 
@@ -223,10 +201,21 @@ class Surface(ABC):
 
     def layer(self, center: ArrayLike, size: float, depth: float) -> PosedShape:
         """A mesh of a thickness `depth` below a piece of the surface; arguments as of `picture`."""
-        place, lengths = np.asarray(center, float), self._lengths(size)
-        counts = facets_needed(self._patch(place, size, EVEN, EVEN))
-        rows, columns = (sides(*side, depth) for side in zip(counts, lengths, strict=True))
-        return layer_below(self._patch(place, size, rows, columns), self._linear(), depth)
+        place, ends = np.asarray(center, float), []
+        even = self._patch(place, size, EVEN, EVEN)
+        _check_whole(even)
+        for axis, length in enumerate(self._lengths(size)):
+            bend = np.linalg.norm(np.diff(even, 2, axis=axis), axis=-1).max() / 8.0
+            needed = np.ceil((EVEN.size - 1) * (bend / _SAG) ** 0.5)
+            if not (rim := _RIM * depth / length) < 0.25:
+                raise ModelError(
+                    f"a piece of {length:.3g} m is too short for a layer of {depth:g} m, whose "
+                    f"rims take {2 * _RIM * depth:.3g} m; use a smaller plant.thickness, or a "
+                    "larger plant.piece"
+                )
+            inner = np.linspace(rim - 0.5, 0.5 - rim, int(np.clip(needed, _LEAST, _MOST)) + 1)
+            ends.append(np.concatenate([[-0.5], inner, [0.5]]))
+        return layer_below(self._patch(place, size, *ends), self._linear(), depth)
 
     def _lengths(self, size: float) -> Pair:
         """The lengths of a patch along rows and columns in m."""

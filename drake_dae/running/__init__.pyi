@@ -1,5 +1,5 @@
 """The names of the room, each with its home."""
 
-from .export.controller import export_controller as export_controller
-from .export.loop import export_loop as export_loop
+from .export import export_controller as export_controller
+from .export import export_loop as export_loop
 from .rollout import start_values as start_values

@@ -7,7 +7,8 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorConfig
+from pydrake.common import RandomGenerator
+from pydrake.systems.analysis import Simulator, SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
@@ -21,7 +22,7 @@ from drake_dae.blocks.failures import (
 )
 from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
-from drake_dae.blocks.stepping import Run, RunEnding, StepSettings
+from drake_dae.blocks.stepping import Look, Run, RunEnding, RunProblem, StepSettings
 from drake_dae.blocks.trials import PACE_STEPS
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
@@ -32,8 +33,8 @@ from drake_dae.errors import (
     NonFiniteError,
     SimulationError,
 )
-from drake_dae.running.diagnosis import IN_ROLLOUT, MANY, explained, too_long, warn_if_stiff
-from drake_dae.running.drake_stepped import run_stepped
+from drake_dae.running.diagnosis import IN_ROLLOUT, MANY, RunWatch, warn_if_stiff
+from drake_dae.running.merged_run import NO_EVENTS, MergedRun
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, Seed, program_of
 from drake_dae.running.simulate import check_config
 from drake_dae.systems.plant import Plant
@@ -43,6 +44,7 @@ SEVERAL = 8  # The least number of runs that go side by side; fewer give the bit
 STAGES_PER_SECOND = 500  # An estimate of the evaluations in a simulated second under error control.
 # The time that runs side by side save per evaluation, over that of an interpreted one.
 FASTER = 0.05
+LOOKED = 64  # The rows after which a run by Drake looks whether it diverges, or is to stop.
 # The most failed runs of one call whose cause is looked for, which takes up to a second each.
 DIAGNOSED = 8
 
@@ -143,16 +145,11 @@ def diagnosed(loop: ClosedLoop, rollout: Rollout, config: SimulatorConfig | None
     """A rollout whose failure says its cause, as that of a simulation does."""
     if rollout.failure is None or not rollout.record.time.size:
         return rollout
-    reference = None if loop.generator is None else loop.generator.reference
-    start = float(rollout.record.time[0]), rollout.record["state"][0]
-    structure = loop.controller.law.structure
-    failure = explained(rollout.failure, loop.plant, structure, reference, start)
-    if failure is rollout.failure:
-        context = loop.diagram.CreateDefaultContext()
-        loop.plant.set_state(loop.plant.GetMyMutableContextFromRoot(context), start[1])
-        begun = start[0], context.get_continuous_state_vector().CopyToVector()
-        failure = too_long(failure, loop.diagram, context, config or SimulatorConfig(), begun)
-    return replace(rollout, failure=failure)
+    context, record = loop.diagram.CreateDefaultContext(), rollout.record
+    context.SetTime(float(record.time[0]))
+    loop.set_state(context, record["state"][0])
+    watch = RunWatch(loop.diagram, context, config or SimulatorConfig(), 1.0)
+    return replace(rollout, failure=watch.with_cause(rollout.failure))
 
 
 def run_loop(
@@ -213,7 +210,9 @@ def run_loop(
         elif code is not None:
             made = run_alone(code, some, settings)
         elif kind.drake is not None:
-            made = [run_stepped(kind, some.run(i), settings) for i in range(indices.size)]
+            of_run = [None if seeds is None else seeds[i] for i in indices.tolist()]
+            given = config, choice, settings.look
+            made = [_run_by_drake(kind, some.run(i), s, *given) for i, s in enumerate(of_run)]
         else:
             each = map(some.run, range(indices.size))
             made = [run_interpreted(kind.functions, one, settings) for one in each]
@@ -233,6 +232,44 @@ def run_loop(
                 failure = _failure(program, problems.run(i).parameters, runs[i])
         found.append(Rollout(runs[i].steps, failure, program, moments, runs[i].rows))
     return found
+
+
+def _run_by_drake(
+    program: RolloutProgram,
+    problem: RunProblem,
+    seed: Seed | None,
+    config: SimulatorConfig,
+    compiled: Compiled,
+    look: Look,
+) -> Run:
+    """A run of a diagram with a plant that only Drake steps, by its Simulator."""
+    context, rows = program.context.Clone(), list[FloatArray]()
+    program.put(context, float(problem.times[0]), problem.state, problem.held, problem.parameters)
+    for number, source in enumerate(program.sources.values()):
+        if (chosen := program.seed_of(seed, number)) is not None:
+            generator = RandomGenerator(chosen)
+            source.SetRandomContext(source.GetMyMutableContextFromRoot(context), generator)
+    assert program.drake is not None
+    program.drake.ExecuteInitializationEvents(program.drake.GetMyMutableContextFromRoot(context))
+    ending, error = RunEnding.DONE, None
+    with MAKING:  # Its functions are made when they are called first.
+        given = program.diagram, context, {n: program.ports[n] for n in program.signals}, compiled
+        run: MergedRun = program.kept(f"merged {compiled}", lambda: MergedRun(*given))
+        run.begin(context, config)
+        try:
+            for time in problem.times.tolist():
+                rows.append(run.row(time))
+                if len(rows) % LOOKED == 0 and look(lambda: np.array(rows)):
+                    ending = RunEnding.PAUSED
+                    break
+        except DrakeDaeError:  # Whose reason the blocks as wired know.
+            ending = RunEnding.INVALID
+        except RuntimeError as raised:  # Of Drake's solver.
+            ending, error = RunEnding.STUCK, raised
+        run.write_back(0)
+    table = np.array(rows).reshape(-1, program.functions.row.numel_out(0))
+    state, held, _ = program.values_in(context)
+    return Run(table, ending, context.get_time(), state, held, run.steps, error=error)
 
 
 def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> SimulationError:
@@ -286,7 +323,7 @@ def _reason(
             port.Eval(context if system is diagram else system.GetMyContextFromRoot(context))
         if program.functions.rates:
             simulator = Simulator(diagram, context)
-            simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+            simulator.Initialize(NO_EVENTS)
             simulator.AdvanceTo(time + 1e-6 * min(r.period for r in program.functions.rates))
             simulator.AdvancePendingEvents()
     except SimulationError as error:

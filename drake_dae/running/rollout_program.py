@@ -19,7 +19,7 @@ from pydrake.systems.primitives import RandomSource
 from drake_dae.arguments import uncollected
 from drake_dae.arrays import FloatArray, brief, by_columns, numbers
 from drake_dae.blocks.block import Block, Held, stacked
-from drake_dae.blocks.compose import Leaves, compose, laws_of, leaf_inputs
+from drake_dae.blocks.compose import Leaves, compose, laws_of
 from drake_dae.blocks.machine import Stepper, can_run_several, load
 from drake_dae.blocks.stepping import RunProblem, StepFunctions
 from drake_dae.blocks.traced_system import TracedSystem, context_in
@@ -27,15 +27,14 @@ from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError
+from drake_dae.running.merged_run import parameters_in
 from drake_dae.systems.ideal_plants import DaePlant
-from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plant import plants_in
+from drake_dae.systems.plant import ParameterizedSystem, plants_in
 from drake_dae.trace.compiled import Compiled, attempts
 
 # The seed of the noise of a run: one number, or name of a RandomSource -> number.
 Seed = int | Mapping[str, int]
 SAME = 1e-9  # Times that differ by less than this, in periods, are equal.
-CONTROL = "$control"  # The control of Drake's plant among the outputs of the block.
 # What is made once is made by one thread; expressions of CasADi cannot be shared by several.
 MAKING = RLock()
 
@@ -56,7 +55,7 @@ class RolloutProgram:
         context: Context | None = None,
         like: "RolloutProgram | None" = None,
     ) -> None:
-        self.loop, self._made = loop, dict[str, Any]()
+        self.loop, self.made = loop, dict[str, Any]()
         signals, self.choice = dict[str, Sequence[Signal]](), cast(Compiled, "auto")
         if isinstance(loop, ClosedLoop):
             self.diagram, self.name = loop.diagram, loop.plant.get_name()
@@ -73,14 +72,10 @@ class RolloutProgram:
         ports = [p for p in ports if p.get_data_type() == PortDataType.kVectorValued]
         self.ports = {p.get_name(): p for p in ports if not signals or p.get_name() in signals}
         stepped = [plant for plant in plants_in(diagram) if plant.time_step]
-        self.is_discrete, wanted = bool(stepped), dict(self.ports)
+        self.is_discrete = bool(stepped)
         self.drake = next((p for p in stepped if not isinstance(p, TracedSystem)), None)
-        if self.drake is not None:
-            (entry,) = leaf_inputs(self.drake, int(self.drake.GetInputPort("control").get_index()))
-            system, index = leaves.sources[entry]
-            wanted[CONTROL] = system.get_output_port(index)
         self.composed = composed = compose(
-            diagram, wanted, context=self.context, shares=like is not None
+            diagram, self.ports, context=self.context, shares=like is not None
         )
         inside = Leaves.of(self.drake).systems if isinstance(self.drake, Diagram) else [self.drake]
         self.stepped = {name: cut for name, cut in composed.cuts.items() if cut[0] in inside}
@@ -88,12 +83,6 @@ class RolloutProgram:
         outputs = {each: block.outputs[each] for each in signals or self.ports}
         self.functions = StepFunctions(replace(block, outputs=outputs))
         self.num_states = block.state.numel()
-        if self.drake is not None and (states := list(composed.states)):
-            raise ModelError(
-                f"a rollout cannot combine '{self.drake.get_name()}', which has Drake's own "
-                f"contact, with '{states[0].get_name()}', which has a continuous state. Sample the "
-                "law, with a force sensor without a time constant, or run the loop by simulate"
-            )
         self.signals = signals or {
             each: composed.block.signals.get(each)
             or [Signal(f"{each}[{i}]") for i in range(value.numel())]
@@ -121,14 +110,9 @@ class RolloutProgram:
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
         with MAKING:
-            if name not in self._made:
-                self._made[name] = make()
-            return self._made[name]
-
-    @property
-    def stepper(self) -> Stepper | None:
-        """Its machine code; None if there is none yet."""
-        return self._made.get("code")
+            if name not in self.made:
+                self.made[name] = make()
+            return self.made[name]
 
     @property
     def shared(self) -> "RolloutProgram":
@@ -178,8 +162,8 @@ class RolloutProgram:
         if several and not self.kept("lanes do", lambda: can_run_several(self.functions)):
             return None
         name = "lanes" if several else "code"
-        self._made[name] = self._made.get(name) or load(self.functions, choice, make, several)
-        code: Stepper | None = self._made[name]
+        self.made[name] = self.made.get(name) or load(self.functions, choice, make, several)
+        code: Stepper | None = self.made[name]
         return code
 
     @property
@@ -202,11 +186,7 @@ class RolloutProgram:
         for name, (system, i) in composed.cuts.items():
             value = system.get_output_port(i).Eval(context_in(system, context))
             held[self.held_places[name]] = value
-        values = []
-        for system in composed.parameters:
-            local = context_in(system, context)
-            groups = range(local.num_numeric_parameter_groups())
-            values += [local.get_numeric_parameter(i).value() for i in groups]
+        values = [parameters_in(composed, context)]
         for system, i in composed.fixed.values():
             port, local = system.get_input_port(i), context_in(system, context)
             if not port.HasValue(local):
@@ -215,7 +195,7 @@ class RolloutProgram:
                     "this context"
                 )
             values.append(port.Eval(local))
-        return state, held, np.concatenate([np.zeros(0), *values])
+        return state, held, np.concatenate(values)
 
     def put(
         self,
@@ -301,13 +281,17 @@ class RolloutProgram:
             place = self.held_places[name]
             (i,) = (i for i, r in enumerate(self.functions.rates) if place.start in r.places)
             rows, period = np.flatnonzero(due >> i & 1), self.functions.rates[i].period
-            chosen = (seed + number * 2**31) % 2**32 if isinstance(seed, int) else None
-            if isinstance(seed, Mapping):
-                chosen = seed.get(source.get_name())
+            chosen = self.seed_of(seed, number)
             drawn = np.zeros((events.size + 1, place.stop - place.start))
             drawn[[0, *(rows + 1)]] = drawn_noise(source, start, events[rows], period, chosen)
             columns.append(drawn)
         return np.concatenate(columns, axis=1)
+
+    def seed_of(self, seed: Seed | None, number: int) -> int | None:
+        """The seed of one of the sources."""
+        if isinstance(seed, Mapping):
+            return seed.get([*self.sources.values()][number].get_name())
+        return None if seed is None else (int(seed) + number * 2**31) % 2**32
 
     def _check_starts(self, problems: RunProblem) -> None:
         """Refuses starts that are off N*."""
@@ -363,6 +347,9 @@ class RolloutProgram:
         return self.loop.with_errors(record) if isinstance(self.loop, ClosedLoop) else record
 
 
+_of_diagram = lru_cache(maxsize=4)(RolloutProgram)
+
+
 def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
     """The program of a closed loop or of any diagram, which is made once."""
     with MAKING:
@@ -371,12 +358,7 @@ def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
         if "program" not in loop.memory:
             loop.memory["program"] = RolloutProgram(loop)
         program: RolloutProgram = loop.memory["program"]
-    return program
-
-
-@lru_cache(maxsize=4)
-def _of_diagram(diagram: Diagram) -> RolloutProgram:
-    return RolloutProgram(diagram)
+        return program
 
 
 def _table(what: str, given: ArrayLike, size: int) -> FloatArray:

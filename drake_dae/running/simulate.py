@@ -24,9 +24,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.blocks.traced_system import check_context
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
-from drake_dae.running.compiled_run import NO_EVENTS, CompiledRun
 from drake_dae.running.diagnosis import RunWatch
 from drake_dae.running.interruption import Interruption, ending_signals
+from drake_dae.running.merged_run import NO_EVENTS, MergedRun
 
 BAR_PERIOD = 0.1  # The time between updates of the progress bar, in s.
 
@@ -130,7 +130,7 @@ def simulate(
                 simulator.set_monitor(monitor)
             composed = None
             if not config.target_realtime_rate:
-                composed = CompiledRun.of(diagram, context, config, duration)
+                composed = MergedRun.of(diagram, context, config, duration)
             is_done = composed is not None and composed.run(start + duration, seen)
             if not is_done:
                 if composed is not None:  # To the failure, whose message the blocks know.

@@ -12,21 +12,13 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context
 
+from drake_dae import dae
 from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.blocks.block import NOTHING, Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae import (
-    ConstraintStructure,
-    DaeSystem,
-    Structure,
-    TrackingLaw,
-    find_constraint_structure,
-    find_structure,
-    places_of,
-    with_disturbance,
-)
+from drake_dae.dae import ConstraintStructure, DaeSystem, Structure, TrackingLaw
 from drake_dae.dae.disturbance import estimated_within
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop, wire_loop
 from drake_dae.diagrams.parts import (
@@ -46,8 +38,8 @@ from drake_dae.errors import (
 )
 from drake_dae.pictures.page.controls import PUSH
 from drake_dae.references import ConstantReference, Reference
-from drake_dae.robots import KnownWrench, PointOnSurface, RobotModel, ScaledForce
-from drake_dae.running.divergence import DivergenceWatch
+from drake_dae.robots import KnownWrench, Load, PointOnSurface, RobotModel, ScaledForce
+from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
@@ -68,18 +60,19 @@ from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
 from drake_dae.systems.controller import Controller, Derived
-from drake_dae.systems.opening_contact import open_contact
 from drake_dae.systems.plant import Plant
 from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.task import open_contact
 from drake_dae.systems.task_controller import TaskController
 
+# The rows of a record under error control, after the first; and the most rows of fixed steps: a
+# larger record takes gigabytes.
 ROWS, MOST_ROWS = 1000, 1e7
-"""The number of rows of a record under error control, after the first; and the largest number of
-rows of fixed steps, since a larger record takes gigabytes."""
-
+# The time by the clock in s between checks of a running rollout for divergence; and the fraction of
+# a step within which two times are equal.
 PERIOD, SAME = 0.2, 1e-6
-"""The time by the clock in s between checks of a running rollout for divergence; and the fraction
-of a step within which two times are equal."""
+# What a person may change in a page beside references.
+_ROUGH, _DRAGGED = "friction of the plant", "surfaces that are dragged"
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -118,7 +111,7 @@ def build_completed(
         for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
             if getattr(scenario, key):
                 raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
-        free = find_constraint_structure(model.dae)
+        free = dae.find_constraint_structure(model.dae)
         plant = make_plant(completed.scenario, model, free)
         return completed, wire_loop(plant, _NoController(free), **drawn)
     if structure is None:
@@ -204,7 +197,7 @@ def build_completed(
         with at("sensors.encoders"):
             make_sensor(plant, settings.encoders, period)
     with at("judgement.tolerances"):
-        places_of("output", scenario.judgement.tolerances, model.dae.output_signals)
+        dae.places_of("output", scenario.judgement.tolerances, model.dae.output_signals)
 
     # The controller and the loop: with a task the law in contact, and one with the contact open.
     if task is not None:
@@ -212,7 +205,7 @@ def build_completed(
         assert gains is not None  # advised.
         names = [signal.name for point in points for signal in point.force_signals]
         with at("task.gains" if task.gains else "law.gains"):
-            free = find_structure(open_contact(law.system, names))
+            free = dae.find_structure(open_contact(law.system, names))
             of_free = TrackingLaw(free.system, gains.design(), structure=free, latency=law.latency)
         with at("task"):
             # The noise of the sum over the points.
@@ -253,12 +246,12 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             raise ScenarioError(("estimator", text + rough * name.endswith(".friction")))
         with at("estimator.parameters"):
             velocities = [signal.name for signal in model.links.velocity_signals]
-            observed = with_disturbance(model.dae, velocities, names)
+            observed = dae.with_disturbance(model.dae, velocities, names)
             friction = {contact.friction for contact in model.dae.contacts}
             others = [p for p in model.dae.parameters if p.name in {*names} - friction]
             estimated_within(others, estimator.ranges)
         with at("estimator"):
-            structure = find_structure(observed)
+            structure = dae.find_structure(observed)
     # The mean time from a sample to the moment when its control acts, for rigid joints. A plant
     # that steps by h damps with the speed at the end of each step: h / 2 later than the mean, and h
     # later than a law without sampling, which acts at each step.
@@ -434,64 +427,44 @@ def build_commanded(scenario: Scenario) -> Commanded:
     if scenario.plant.carries:
         text = "Drake's hydroelastic contact cannot be traced: take a !CompliantContact instead"
         raise ScenarioError(("plant", text))
-    told = [f"Drake's plant: {remark}"] if remark else []
-    extended, left_out = scenario, [*told]
-    for name, add in _CHANGES.items():
-        try:
-            extended = add(extended)
-        except ModelError as error:
-            left_out.append(f"{name}: none, since {error}")
-    try:
-        completed, loop = build_completed(extended, commanded=True)
-    except DrakeDaeError as error:
-        completed, loop = build_completed(scenario, commanded=True)  # Its own errors come first.
-        left_out = [*told, *(f"{name}: {error}" for name in _CHANGES)]
-    # The original exogenous signals decide whether the loop starts at rest.
-    initial = replace(completed.scenario, exogenous=scenario.exogenous)
-    return Commanded(loop, start_scenario(initial, loop), tuple(left_out))
+    told, left_out = [f"Drake's plant: {remark}"] if remark else [], dict[str, str]()
+    robot, constraints, exogenous = scenario.robot, scenario.constraints, {**scenario.exogenous}
 
-
-def _with_friction(scenario: Scenario) -> Scenario:
-    """Adds a coefficient of friction of 0 to frictionless contacts of ideal plants."""
-    points = [c for c in scenario.constraints if isinstance(c, PointOnSurface)]
-    bare = [point for point in points if point.friction is None]
-    if not bare or scenario.plant.material is not None:  # Which has the friction of contacts.
-        return scenario
-    if scenario.actuation:
-        raise ModelError("the law would differentiate it; give the constraint a friction")
-    rough = [replace(c, friction=0.0) if c in bare else c for c in scenario.constraints]
-    return replace(scenario, constraints=rough)
-
-
-def _with_moving_surfaces(scenario: Scenario) -> Scenario:
-    """Makes the positions of surfaces constant exogenous signals."""
+    # Friction of the plant: a coefficient of 0 for frictionless contacts. A compliant contact has
+    # friction and the places of surfaces in its plant alone.
+    points = [c for c in constraints if isinstance(c, PointOnSurface)]
     if scenario.plant.material is not None:
-        return scenario  # Of a compliant contact they are parameters of the plant alone.
-    if scenario.estimator is not None:
-        raise ModelError(
+        points = []
+    bare = [point for point in points if point.friction is None]
+    if bare and scenario.actuation:
+        left_out[_ROUGH] = "the law would differentiate it; give the constraint a friction"
+    else:
+        constraints = [replace(c, friction=0.0) if c in bare else c for c in constraints]
+
+    # Surfaces that are dragged: their places are constant exogenous signals.
+    if points and scenario.estimator is not None:
+        left_out[_DRAGGED] = (
             "an estimator does not know how a surface moves, and an ideal contact needs a law that "
             "does; with `plant: !CompliantContact` they are dragged"
         )
-    points = [c for c in scenario.constraints if isinstance(c, PointOnSurface)]
-    places = [c.parameters[0] for c in points if c.parameters[0].name not in scenario.exogenous]
-    still: dict[str, Any] = {p.name: [*map(ConstantReference, p.value.tolist())] for p in places}
-    return replace(scenario, exogenous={**scenario.exogenous, **still})
+    else:
+        for place in (point.parameters[0] for point in points):
+            exogenous.setdefault(place.name, [*map(ConstantReference, place.value.tolist())])
 
-
-def _with_pushes(scenario: Scenario) -> Scenario:
-    """Adds a zero wrench to each movable link."""
-    robot, pushes = scenario.robot, []
-    plant = robot_links(robot, SceneGraph(), drawn=False)[0].plant
+    # Links that are pushed: a zero wrench on each that moves and is drawn.
+    plant, pushes = robot_links(robot, SceneGraph(), drawn=False)[0].plant, list[Load]()
     for body in (plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())):
         if plant.GetVisualGeometriesForBody(body) and not plant.IsAnchored(body):
             name = body.scoped_name().get_full()
             pushes.append(KnownWrench(name, name=PUSH + name))
-    return replace(scenario, robot=replace(robot, known_forces=[*robot.known_forces, *pushes]))
-
-
-_CHANGES: dict[str, Callable[[Scenario], Scenario]] = {
-    "friction of the plant": _with_friction,
-    "surfaces that are dragged": _with_moving_surfaces,
-    "links that are pushed": _with_pushes,
-}
-"""What a person may change beside references, and what it adds to a scenario."""
+    robot = replace(robot, known_forces=[*robot.known_forces, *pushes])
+    extended = replace(scenario, robot=robot, constraints=constraints, exogenous=exogenous)
+    reasons = [f"{name}: none, since {reason}" for name, reason in left_out.items()]
+    try:
+        completed, loop = build_completed(extended, commanded=True)
+    except DrakeDaeError as error:
+        completed, loop = build_completed(scenario, commanded=True)  # Its own errors come first.
+        reasons = [f"{name}: {error}" for name in (_ROUGH, _DRAGGED, "links that are pushed")]
+    # The original exogenous signals decide whether the loop starts at rest.
+    initial = replace(completed.scenario, exogenous=scenario.exogenous)
+    return Commanded(loop, start_scenario(initial, loop), (*told, *reasons))

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, groupby
 from math import comb
 from typing import Any
 
@@ -65,24 +65,31 @@ def completions(
 
     Starts and sets of joints are compared by the least `Postures.quality` along the reference.
     """
-    search = _Search(scenario, links, constraints)
-    if search.is_left_alone:
+    search, given = _Search(scenario, links, constraints), scenario.start.positions
+    # Nothing is missing, nothing can be said, or the model refuses the actuators.
+    is_placed = bool(given) if scenario.task else len(given) == len(links.position_signals)
+    if (
+        search.missing < (1 if is_placed else 0)
+        or not search.is_controlled
+        or scenario.law.control_weights
+        or scenario.compliances is not None
+        or np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals)
+    ):
         yield Completed(scenario)
         return
     search.follow(guess)
-    named, begin, is_given = search.named, search.begin, bool(scenario.start.positions)
+    postures, named = search.postures, search.named
     if search.missing == 0 and scenario.task is None:
-        postures = search.postures
-        q = postures.solve(named, begin, guess)
+        q = postures.solve(named, search.begin, guess)
         if q is not None and (
-            is_given or min(postures.at(x).independence(named) for x in (q, guess)) > _REGULAR
+            given or min(postures.at(x).independence(named) for x in (q, guess)) > _REGULAR
         ):
             yield Completed(scenario)
-            if is_given:
+            if given:
                 return
     starts = search.starts(guess)
     found = list[tuple[tuple[bool, int, float], Posture, list[int]]]()
-    for posture in starts[: 1 if is_given else _POSTURES]:
+    for posture in starts[: 1 if given else _POSTURES]:
         for added in search.added(posture):
             count = len({*added} - {*search.joints})
             rivals = sorted((rank[2] for rank, *_ in found if rank[1] >= count), reverse=True)
@@ -112,58 +119,47 @@ class _Search:
         steered = as_force_outputs(scenario.forces, self._bound)
         self._forces = [s.name for output in steered for s in output.signals(self._bound)]
         self._S = force_rows(steered, self._bound, links)
-        outputs = [make(form, constraints) for form in scenario.outputs]
-        self._signals: list[Signal] = [s for output in outputs for s in output.signals(links)]
-        self._expressions = [output.expression(links) for output in outputs]
-        self._forms: dict[int, WrittenOutput] = {}
+        self._signals, self._expressions = list[Signal](), list[ca.SX]()
+        # Of each row its output, the attribute that holds its rows, and the first of them.
+        self._forms = list[tuple[Any, str, int]]()
+        for form in scenario.outputs:
+            self._add(form, "")
         self._given = len(self._signals)
         controls = len(links.actuator_signals) + len(self._bound.motors)
         self.missing = controls - self._given - self._S.shape[0]
+        self.is_controlled = self._given or self._forces or scenario.references or scenario.task
         touches = {c.name: c.touch(links) for c in self._bound.constraints}
         self._touches = {name: touch for name, touch in touches.items() if touch is not None}
-        taken, kind = {s.name for s in self._signals}, scenario.tool_axis
+        taken, kind = {signal.name for signal in self._signals}, scenario.tool_axis
         self._points, self._outward = list[list[int]](), list[ca.SX]()
         self._tilts, self._axes = list[int](), list[int]()
         for name, touch in self._touches.items():
             # Names are unique: the constraint's name is used if the frame's is taken.
-            others = {a: f"{name}_point" * (f"{touch.frame}.{a}" in taken) for a in "xyz"}
-            points = [PointCoordinates(touch.frame, a, touch.point, others[a]) for a in "xyz"]
-            self._points.append([self._add(form) for form in points])
+            rows, others = dict[str, int](), [a for a in "xyz" if f"{touch.frame}.{a}" in taken]
+            for prefix, axes in (("", {*"xyz"} - {*others}), (f"{name}_point", others)):
+                if letters := "".join(sorted(axes)):
+                    point = PointCoordinates(touch.frame, letters, touch.point, prefix)
+                    rows |= zip(letters, self._add(point, "axes"), strict=True)
+            self._points.append([rows[axis] for axis in "xyz"])
             column, sign = tool_axis(links, touch)
             axis = "xyz"[column]
             self._outward.append(sign * links.rotation(touch.frame)[:, column])
             if kind != "free":
-                forms = [TiltFromNormalForm(name, axis, a) for a in "xyz" if a != axis]
-                self._tilts += [self._add(form) for form in forms]
+                tilt = TiltFromNormalForm(name, axis, "xyz".replace(axis, ""))
+                self._tilts += self._add(tilt, "components")
             if kind == "fixed":
-                fixed = [AxisCoordinates(touch.frame, axis, component) for component in "xyz"]
-                self._axes += [self._add(form) for form in fixed]
+                self._axes += self._add(AxisCoordinates(touch.frame, axis, "xyz"), "components")
         self._axes = self._axes or self._tilts
         self._joints = [s.name for s in links.position_signals]
-        self.joints = [self._add(JointPositions([name])) for name in self._joints]
+        self.joints = self._add(JointPositions(self._joints), "joints")
 
-    def _add(self, form: WrittenOutput) -> int:
-        output, row = make(form, self._bound.constraints), len(self._signals)
+    def _add(self, form: WrittenOutput, of_rows: str) -> list[int]:
+        output, begin = make(form, self._bound.constraints), len(self._signals)
         self._expressions.append(output.expression(self._links))
-        self._forms[row] = form
         self._signals += output.signals(self._links)
-        return row
-
-    @property
-    def is_left_alone(self) -> bool:
-        """Whether nothing is missing, nothing can be said, or the model refuses the actuators."""
-        scenario, links = self._scenario, self._links
-        start, is_task = scenario.start.positions, scenario.task is not None
-        is_placed = bool(start) if is_task else len(start) == len(links.position_signals)
-        is_controlled = bool(self._given or self._forces or scenario.references or is_task)
-        rank = np.linalg.matrix_rank(links.actuation_matrix)
-        return (
-            self.missing < (1 if is_placed else 0)
-            or not is_controlled
-            or bool(scenario.law.control_weights)
-            or scenario.compliances is not None
-            or bool(rank < len(links.actuator_signals))
-        )
+        rows = [*range(begin, len(self._signals))]
+        self._forms += [(form, of_rows, begin)] * len(rows)
+        return rows
 
     def _postures(self, moved: Mapping[str, FloatArray]) -> Postures:
         """The configurations of the robot at the start, with some parameters moved."""
@@ -205,28 +201,32 @@ class _Search:
         every = dict.fromkeys(row for _, rows in known for row in rows if row is not None)
         more = [row for row in every if row >= self._given]
         if len(more) > self.missing:
-            names = ", ".join(self._signals[row].name for row in more)
-            text = f"{names} are {len(more)} outputs, but only {self.missing} are missing"
-            raise ScenarioError((key, text))
-        left = [self._signals[row].name for row in range(self._given) if row not in every]
+            text = f"are {len(more)} outputs, but only {self.missing} are missing"
+            raise ScenarioError((key, f"{self._names(more)} {text}"))
+        left = [row for row in range(self._given) if row not in every]
         if left and scenario.task is None:
-            raise ScenarioError((key, f"missing: {', '.join(left)}"))
-        self.named = [*range(self._given), *more]
+            raise ScenarioError((key, f"missing: {self._names(left)}"))
+        self.named, self._room = [*range(self._given), *more], self.missing - len(more)
 
-        def values_at(time: float) -> tuple[FloatArray, FloatArray]:
-            found = {row: (near.rows[row], 0.0) for row in self.named}  # If nothing refers to them.
+        def values_at(time: float) -> FloatArray:
+            values = np.column_stack(
+                [near.rows, np.zeros_like(near.rows)]
+            )  # If nothing refers to them.
             for function, rows in known:
-                pairs = zip(rows, function(time), strict=True)
-                found |= {row: (pair[0], pair[1]) for row, pair in pairs if row is not None}
-            values, rates = np.array([found[row] for row in self.named]).reshape(-1, 2).T
-            return values, rates
+                for row, pair in zip(rows, function(time), strict=True):
+                    if row is not None:
+                        values[row] = pair
+            return values[self.named]
 
         begin = scenario.integrator.start_time
         end = begin if scenario.task else begin + scenario.duration
         self.path = [values_at(time) for time in np.unique(np.linspace(begin, end, _TIMES))]
         errors = scenario.start.errors
         off = [errors.get(self._signals[row].name, 0.0) for row in self.named]
-        self.begin = self.path[0][0] + off
+        self.begin = self.path[0][:, 0] + off
+
+    def _names(self, rows: Sequence[int]) -> str:
+        return ", ".join(self._signals[row].name for row in rows)
 
     def _of_phases(self) -> dict[str, Any]:
         """The first reference that a phase of the task gives each output, without distances."""
@@ -318,8 +318,7 @@ class _Search:
 
     def added(self, posture: Posture) -> Iterator[list[int]]:
         """The rows that complete the named ones, by the rule of `complete_scenario`."""
-        named = self.named
-        room = self.missing - (len(named) - self._given)
+        named, room = self.named, self._room
         if not room:
             yield []
             return
@@ -332,11 +331,16 @@ class _Search:
         for directions in [axes, []] if axes else [[]]:
             held = [*named, *added, *directions]
             count = room - len(added) - len(directions)
-            joints = [row for row in self.joints if row not in held]
+            joints, one = [row for row in self.joints if row not in held], list[int]()
+            sets = [one]
             if comb(len(joints), count) <= 500:
                 sets = [list(chosen) for chosen in combinations(joints, count)]
-            else:
-                sets = [posture.most_independent(held, joints, count)]
+            else:  # Each is the most independent of those before it.
+                for _ in range(count):
+                    rest = [row for row in joints if row not in one]
+                    quality = [posture.independence([*held, *one, row]) for row in rest]
+                    one.append(rest[int(np.argmax(quality))])
+                one.sort()
             ranked = [(posture.independence([*held, *chosen]), chosen) for chosen in sets]
             ranked = [entry for entry in ranked if entry[0] > INDEPENDENT / 10]
             for _, chosen in sorted(ranked, key=lambda entry: -entry[0])[:_SETS]:
@@ -361,7 +365,7 @@ class _Search:
     ) -> Iterator[tuple[Posture | None, FloatArray]]:
         """The posture at each time of the references, None out of reach; and the rates of rows."""
         wanted, count, q = posture.rows[list(rows)], len(self.named), posture.q
-        for values, rates in self.path:
+        for values, rates in map(np.transpose, self.path):
             wanted[:count] = values
             found = self.postures.solve(rows, wanted, q)
             q = posture.q if found is None else found
@@ -371,23 +375,26 @@ class _Search:
     def written(self, posture: Posture, added: Sequence[int]) -> Completed:
         """The scenario with outputs, references and start, and notes."""
         scenario, notes, held = self._scenario, list[str](), [*self.named, *added]
-        names, chosen = [signal.name for signal in self._signals], held[self._given :]
-        if chosen:
+        if chosen := held[self._given :]:
             joints = " (joints so that B(x) is best conditioned)" * bool({*added} & {*self.joints})
-            left = "; the tool's axis is left free" * bool(
-                self._axes and not {*held} & {*self._axes}
-            )
-            listed = ", ".join(names[row] for row in chosen)
-            notes.append(f"outputs completed by {listed}{joints}{left}")
-            outputs = [*scenario.outputs, *_joined(self._forms[row] for row in chosen)]
+            is_free = self._axes and not {*held} & {*self._axes}
+            left = "; the tool's axis is left free" * bool(is_free)
+            notes.append(f"outputs completed by {self._names(chosen)}{joints}{left}")
+            outputs = [*scenario.outputs]
+            for (form, key, begin), rows in groupby(chosen, lambda row: self._forms[row]):
+                part = getattr(form, key)
+                parts = [part[row - begin] for row in rows]
+                outputs.append(
+                    replace(form, **{key: "".join(parts) if isinstance(part, str) else parts})
+                )
             scenario = replace(scenario, outputs=outputs)
         if added and scenario.task is None:
             # A joint that the task leaves free is held where it starts: its error is no fault.
             values = _rounded(posture.rows)
             upright = np.max(np.abs(posture.rows[self._tilts]), initial=0.0) < 1e-6
             values[self._tilts] *= not upright
-            resting = {names[row]: float(values[row]) for row in added}
-            free = dict.fromkeys(names[row] for row in added if row in self.joints)
+            resting = {self._signals[row].name: float(values[row]) for row in added}
+            free = {self._signals[row].name: None for row in added if row in self.joints}
             tolerances = {**free, **scenario.judgement.tolerances}
             scenario = replace(
                 scenario,
@@ -402,16 +409,11 @@ class _Search:
         positions = dict(zip(self._joints, _rounded(q).tolist(), strict=True))
         texts = (f"{name}: {value:.4g}" for name, value in positions.items())
         notes.append(f"start found: {{{', '.join(texts)}}}")
-        start = replace(scenario.start, positions=positions)
-        critical = [
-            now.critical_friction(contact, rows)
-            for now, _ in self._followed(posture, held)
-            for contact, rows in enumerate(self._points)
-            if now is not None
-        ]
-        return Completed(
-            replace(scenario, start=start), tuple(notes), min(critical, default=np.inf)
-        )
+        scenario = replace(scenario, start=replace(scenario.start, positions=positions))
+        followed = [now for now, _ in self._followed(posture, held) if now is not None]
+        points = enumerate(self._points)
+        critical = [now.critical_friction(*point) for point in points for now in followed]
+        return Completed(scenario, tuple(notes), min(critical, default=np.inf))
 
     def _off_surface(self, touching: Posture, held: Sequence[int]) -> FloatArray:
         """The configuration with the same outputs, `BEFORE` the surface of a task."""
@@ -439,9 +441,7 @@ class _Search:
         rank = int(np.count_nonzero(values > 1e-6 * np.max(values, initial=0.0)))
         if rank < len(forces):
             weights = np.linalg.norm(left[:, rank:], axis=1)
-            dependent = [
-                name for name, weight in zip(forces, weights, strict=True) if weight > 1e-6
-            ]
+            dependent = [name for name, w in zip(forces, weights, strict=True) if w > 1e-6]
             return "forces", (
                 f"{', '.join(dependent)} depend on each other at the start: of {len(forces)} force "
                 f"outputs {rank} are independent. Leave out {len(forces) - rank} of them; a force "
@@ -449,9 +449,9 @@ class _Search:
             )
         ways = len(posture.mass) - int(np.linalg.matrix_rank(posture.constraints, 1e-9))
         if needed <= ways:
-            names = ", ".join(self._signals[row].name for row in self.named) or "the constraints"
+            named = self._names(self.named) or "the constraints"
             return "outputs", (
-                f"{self.missing} are missing, and no positions of joints beside {names} leave B(x) "
+                f"{self.missing} are missing, and no positions of joints beside {named} leave B(x) "
                 "regular; name others under outputs"
             )
         possible = ", ".join(signal.name for signal in self._bound.force_signals)
@@ -461,27 +461,6 @@ class _Search:
             f"{needed - ways} more must be forces, of {possible}; or leave actuators out by "
             "robot.actuators"
         )
-
-
-_JOINED = {
-    PointCoordinates: "axes",
-    AxisCoordinates: "components",
-    TiltFromNormalForm: "components",
-    JointPositions: "joints",
-}
-"""Which attribute of an output holds its rows."""
-
-
-def _joined(forms: Iterator[WrittenOutput]) -> list[WrittenOutput]:
-    """The same rows in fewer outputs: neighbours that differ only in their rows are joined."""
-    outputs: list[Any] = []
-    for form in forms:
-        key, last = _JOINED[type(form)], outputs[-1] if outputs else None
-        if type(last) is type(form) and replace(form, **{key: getattr(last, key)}) == last:
-            outputs[-1] = replace(form, **{key: getattr(last, key) + getattr(form, key)})
-        else:
-            outputs.append(form)
-    return outputs
 
 
 def _rounded(values: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ plain data it is an entry "_tag" as Drake has it.
 import inspect
 import json
 import re
+import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -15,18 +16,7 @@ from difflib import get_close_matches
 from functools import cache, cached_property
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    Literal,
-    NotRequired,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, ClassVar, Literal, NotRequired, TypeVar, Union
 
 import numpy as np
 import pydantic
@@ -159,16 +149,13 @@ def _shown(data: Any) -> str:
 
 _WORDS = {
     "float_type": "a number",
-    "finite_number": "a finite number",
     "greater_than": "a positive number",
     "greater_than_equal": "0 or more",
-    "int_type": "a whole number",
     "bool_type": "true or false",
     "string_type": "text",
-    "list_type": "a list",
     "dict_type": "names with values",
 }
-"""What is expected, by pydantic's name of the problem."""
+"""What is expected, by pydantic's name of the problem, where its own words are a programmer's."""
 
 
 def _told(error: ErrorDetails, tag: str, names: Sequence[str], no_tag: str) -> InitErrorDetails:
@@ -285,7 +272,7 @@ class Reader:
 
     def _type(self, hint: Any) -> Any:
         """The pydantic type of data for an annotation."""
-        origin, parts, members = get_origin(hint), get_args(hint), _members(hint)
+        origin, parts, members = typing.get_origin(hint), typing.get_args(hint), _members(hint)
         if origin is Annotated:
             return Annotated[self._type(parts[0]), *parts[1:]]
         for base, data in self._data_for.items():
@@ -311,7 +298,7 @@ class Reader:
         """The type of the data of a form."""
         entries, keys = dict[str, Any](), self._keys_of(form)
         for name, key in keys.items():
-            if any(get_origin(one) in (dict, Mapping) for one in _members(key.hint)):
+            if any(typing.get_origin(one) in (dict, Mapping) for one in _members(key.hint)):
                 self._free.add(name)
             more = {} if key.default is MISSING else {"default": self.write(key.default)}
             about = pydantic.Field(description=key.text or None, json_schema_extra=more)
@@ -363,13 +350,13 @@ class Reader:
 
 def _members(hint: Any) -> set[Any]:
     """The members of a Union; any other annotation is its own only member."""
-    return set(get_args(hint)) if get_origin(hint) in (Union, UnionType) else {hint}
+    return set(typing.get_args(hint)) if typing.get_origin(hint) in (Union, UnionType) else {hint}
 
 
 @cache
 def keys_of(form: type) -> Mapping[str, Key]:
     """The keys of a dataclass: the fields that its constructor takes."""
-    hints, texts = get_type_hints(form, include_extras=True), dict[str, str]()
+    hints, texts = typing.get_type_hints(form, include_extras=True), dict[str, str]()
     for cls in reversed(form.__mro__):  # Their texts are in docstrings, also of bases.
         _, _, rest = inspect.cleandoc(cls.__doc__ or "").partition("\nAttributes:\n")
         section = re.split(r"^\S", rest, maxsplit=1, flags=re.MULTILINE)[0]
@@ -387,16 +374,15 @@ def keys_of(form: type) -> Mapping[str, Key]:
     }
 
 
+_REPLACED = ("int", "float", "timestamp")
+
+
 class _Loader(yaml.SafeLoader):
     """YAML 1.1 with numbers as in JSON, and tags."""
 
     yaml_implicit_resolvers: ClassVar = {  # Without the types whose forms are replaced below.
-        first: [
-            (tag, form)
-            for tag, form in resolvers
-            if tag.rpartition(":")[2] not in ("int", "float", "timestamp")
-        ]
-        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+        first: [pair for pair in pairs if pair[0].rpartition(":")[2] not in _REPLACED]
+        for first, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
     def construct_tagged(self, tag: str, node: yaml.Node) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from typing import Any
 
@@ -23,20 +23,20 @@ from drake_dae.analysis import (
     to_text,
 )
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import Signal, ZeroDynamics, find_structure
+from drake_dae.dae import Signal, Structure, ZeroDynamics, find_structure
+from drake_dae.dae.advised_gains import RAMP
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots import Constraint, LinkBehind, RobotModel, Surface, links_behind, own_values
-from drake_dae.running.judgement import FindingKind, Outcome, RunFinding
+from drake_dae.running.judgement import FindingKind, Outcome, OutputQuality, RunFinding
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import check_task, tracking_law
-from drake_dae.scenario.expected import beyond_stated
 from drake_dae.scenario.form import at
-from drake_dae.scenario.gains import advised
+from drake_dae.scenario.gains import advised, expected, moved_points, stated_errors
 from drake_dae.scenario.model import (
     completed_model,
     exogenous_references,
@@ -47,17 +47,16 @@ from drake_dae.scenario.model import (
 )
 from drake_dae.scenario.scenario import Scenario
 
+# The least number of examined times along a reference, the most along a fast one, and the most of a
+# record at which its references are examined.
 SAMPLES, MOST_SAMPLES, MOST_TIMES = 1001, 20_000, 2000
-"""The smallest number of examined times along a reference, the largest along a fast one, and the
-most times of a record at which its references are examined."""
-
+# The allowed deviation of a reference from linear interpolation between two times, relative to its
+# range; the shortest interval that is divided, relative to the whole; and the share of a run that
+# broke off, at its end, in which its limits are not judged.
 STRAIGHT, SHORTEST, BREAK = 0.01, 1e-6, 0.01
-"""The allowed deviation of a reference from linear interpolation between two times, relative to its
-range; the shortest interval that is divided, relative to the whole; and the share of a run that
-broke off, at its end, in which its limits are not judged."""
-
+_BEYOND = 2.0  # A run is reported whose errors exceed the stated ones by this factor.
+# The remedy for a link behind a surface.
 WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
-"""The remedy for a link behind a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +86,10 @@ class Feasibility:
     def problems(self) -> tuple[str, ...]:
         """The problems, one text each; empty if there are none."""
         found = [*self.analysis.problems, *(str(r.excess) for r in self.ranges if r.excess)]
-        found += [*(f"{link}: {WRONG_SIDE}" for link in self.behind), *filter(None, [self.gains])]
+        found += [*(f"{link}: {WRONG_SIDE}" for link in self.behind), self.gains]
         if self.slowing is not None:
             found.append(f"most of all {self.slowing.excess}; {self.slowing.remedy}")
-        return tuple(found)
+        return tuple(filter(None, found))
 
     def to_dict(self) -> dict[str, Any]:
         groups = {
@@ -110,7 +109,7 @@ class Feasibility:
         }
 
     def __str__(self) -> str:
-        rows = []
+        rows, parts, motion = list[list[str]](), self.analysis.parts(), self.analysis.motion
         for r in self.of(*LimitKind):
             limits = f"{r.low:.4g} to {r.high:.4g}" if r.low != -r.high else f"{r.high:.4g}"
             limits = "pushes only" if r.kind is LimitKind.FORCE and r.low == 0.0 else limits
@@ -121,11 +120,9 @@ class Feasibility:
             remark = "" if r.beyond_time is None else f"left at {r.beyond_time:.4g} s"
             row = [digits(r.least), low, digits(r.largest), high, limits, remark]
             rows.append([r.signal.name, r.signal.unit or "1", *row])
-        parts = list(self.analysis.parts())
         if rows:
             head = ["needed along the reference", "unit", "least", "at", "largest", "at", "limit"]
             parts.append(Table([*head, ""], rows, left=2))
-        motion = self.analysis.motion
         if motion is not None and motion.times.size:
             text = f"Started without errors, and examined at {motion.times.size} times."
             if not self.is_resolved:
@@ -144,13 +141,14 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     check_task(scenario)
     completed, model, _ = completed_model(scenario)
     scenario, gains = completed.scenario, ""
+    examined, structure, law = None, None, None
     try:
-        examined = of_steered(model, examine) if scenario.task is None else None
-        structure = None if examined is None or examined.problems else examined.structure
+        if scenario.task is None:
+            examined = of_steered(model, examine)
+            structure = None if examined.problems else examined.structure
         structure = structure or scenario_structure(model)
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    law = None
     try:
         law = tracking_law(advised(scenario, model, structure).scenario, model, structure)
     except ScenarioError as error:
@@ -192,13 +190,10 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
 def sample_times(
     reference: Callable[[float], FloatArray], begin: float, end: float
 ) -> tuple[FloatArray, bool]:
-    """Sample times between which a reference is nearly linear.
-
-    Equidistant times would miss a sinusoid whose period is the interval. Each interval is tested at
-    a random time and divided if the reference is not linear there, until no interval is divided.
-    """
-    random = np.random.default_rng(0)
-    times = np.linspace(begin, end, SAMPLES)
+    """Sample times between which a reference is nearly linear, and whether there are enough."""
+    # Equidistant times would miss a sinusoid whose period is the interval. Each interval is tested
+    # at a random time, and divided if the reference is not linear there.
+    random, times = np.random.default_rng(0), np.linspace(begin, end, SAMPLES)
     values = np.array([reference(time) for time in times])
     while True:
         share = random.uniform(0.3, 0.7, times.size - 1)
@@ -228,36 +223,34 @@ def judge_run(
     """Judges a run by its record."""
     # What exceeds its limits, and which links are behind surfaces. The last numbers of a run that
     # broke off are not those of its motion.
-    wanted = scenario.judgement
-    model, changes, stop = loop.plant.robot("a scenario"), loop.changes(record), record.time.size
+    wanted, remedies, notes = scenario.judgement, list[str](), list[str]()
+    model, law, goal = loop.plant.robot("a scenario"), loop.controller.law, loop.generator
+    dae, times, stop = model.dae, record.time, record.time.size
     limits = robot_limits(model, wanted.friction_cones)
     if failure:
-        first, last = record.time[[0, -1]]
-        stop = max(1, int(np.searchsorted(record.time, last - BREAK * (last - first))))
-    ranges = limits.ranges(record.time[:stop], limits.of_record(record)[:stop])
+        stop = max(1, int(np.searchsorted(times, times[-1] - BREAK * (times[-1] - times[0]))))
+    ranges = limits.ranges(times[:stop], limits.of_record(record)[:stop])
     behind = []
-    own = loop.plant_parameters(record, context)
-    for link in links_behind(model, record.time, record["state"], own):
+    for link in links_behind(model, times, record["state"], loop.plant_parameters(record, context)):
         numbers = Signal(link.link, "m"), link.depth, 0.0, link.time
         behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
 
     # How much slower the references must be to keep the limits.
-    remedies, dae, law, goal = list[str](), model.dae, loop.controller.law, loop.generator
     is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
     if is_paced and goal is not None and not dae.exogenous.moving:
         structure = law.structure if law.system is dae else find_structure(dae)
         # The law's own degrees may be higher.
         stacked = stack_references(goal.references, structure.layout.reference_degrees)
-        reference, times = (
-            lambda t: stacked(t).copy(),
-            record.time[:: record.time.size // MOST_TIMES + 1],
-        )
-        motion = ZeroDynamics(dae, structure=structure).motion(reference, times, record["state"][0])
+
+        def reference(time: float) -> FloatArray:
+            return stacked(time).copy()
+
+        some = times[:: times.size // MOST_TIMES + 1]
+        motion = ZeroDynamics(dae, structure=structure).motion(reference, some, record["state"][0])
         found = limits_along(structure, limits, reference, motion)
         remedies.append("the references alone keep all limits" if found is None else found.remedy)
 
     # Approximations, and places beyond the data of surfaces.
-    notes = []
     for constraint in model.constraints:
         surface = constraint.surface_at(own_values(constraint, dae, dae.parameter_values))
         if surface is not None:
@@ -296,7 +289,7 @@ def judge_run(
         loop.predicted_error(record),
         ranges,
         tolerances={n: np.inf if e is None else e for n, e in wanted.tolerances.items()},
-        changes=changes,
+        changes=loop.changes(record),
         ended=ended,
         accuracy=accuracy,
         reasons=[reason for reason, holds in reasons.items() if holds],
@@ -307,6 +300,48 @@ def judge_run(
     )
     notes.append(beyond_stated(scenario, model, law.structure, summary.outputs, record))
     return replace(summary, notes=tuple(dict.fromkeys(filter(None, notes))))
+
+
+def beyond_stated(
+    scenario: Scenario,
+    model: RobotModel,
+    structure: Structure,
+    outputs: Sequence[OutputQuality],
+    record: Record,
+) -> str:
+    """Which assumption failed if the errors of a run are beyond the stated ones, or ""."""
+    stated = stated_errors(scenario, model, structure)
+    if stated is None:
+        return ""
+    points, late = moved_points(model), record.time >= record.time[[0, -1]].mean()
+    pressing = [signal.name for signal in model.dae.constraint_input_signals]
+    found = [
+        float(np.linalg.norm([o.late_rms for o in outputs if o.signal.name in names]))
+        for names in (points, pressing)
+    ]
+    if all(own <= _BEYOND * most for own, most in zip(found, stated, strict=True)):
+        return ""
+    names = [signal.name for signal in record.signals["desired_output"].signals]
+    wanted = record["desired_output"][late][:, [name in pressing for name in names]]
+    step = np.gradient(wanted, record.time[late], axis=0)
+    slope, least = float(np.sqrt(np.mean(step**2))), np.min(record["constraint_force"][late])
+    estimator = scenario.estimator
+    causes = {
+        "drives were at their limits": "excess" in record and bool(record["excess"].any()),
+        "the contact was lost": estimator is not None and least < estimator.least_force,
+        f"the reference of the force changes by {slope:.2g} N/s rms": slope > RAMP,
+    }
+    failed = [cause for cause, holds in causes.items() if holds]
+    if not failed:
+        unknown = "is wrong by more than that"
+        if estimator is not None and estimator.parameters is not None:
+            unknown += "; only " + (", ".join(estimator.parameters) or "a disturbance")
+            unknown += " is estimated"
+        failed = [f"the law's model {unknown}"]
+    return (
+        f"errors of {1e3 * found[0]:.2g} mm and {found[1]:.2g} N rms, where "
+        f"{expected(scenario, stated)}: {', '.join(failed)}"
+    )
 
 
 def _beyond_edge(

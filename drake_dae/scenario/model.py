@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydrake.geometry import SceneGraph
 
+from drake_dae import robots
 from drake_dae.analysis import robot_limits
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
@@ -23,20 +24,7 @@ from drake_dae.errors import (
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.references.by_name import assign, in_order
 from drake_dae.references.reference import stack_references
-from drake_dae.robots import (
-    Constraint,
-    ConstraintSet,
-    Links,
-    MultibodyExpressions,
-    PositionOutput,
-    RobotModel,
-    as_force_outputs,
-    chain,
-    control_choice,
-    force_rows,
-    links_behind,
-    plant_constraints,
-)
+from drake_dae.robots import Constraint, Links, MultibodyExpressions, PositionOutput, RobotModel
 from drake_dae.scenario.completion import Completed, completions
 from drake_dae.scenario.form import at, each
 from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
@@ -46,12 +34,10 @@ from drake_dae.scenario.start import start_guess, start_state
 
 T = TypeVar("T")
 
-NOTHING_FOUND = "no start was found"
-"""How the note begins if no outputs and start are good along the references."""
-
+NOTHING_FOUND = "no start was found"  # So the note begins if none is good along the references.
+# At how many times a completed scenario is examined; the excess over a limit that counts, in its
+# unit; and the size of a surface in m above which its unit is doubtful.
 _TIMES, _SLACK, _LARGE = 201, 1e-6, 10.0
-"""At how many times a completed scenario is examined; the excess over a limit that counts, in its
-unit; and the size of a surface in m above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -128,7 +114,7 @@ def _checked_constraints(
     """The constraints, and a check of every key that the model takes, for errors with its place."""
     robot, forces = scenario.robot, scenario.forces
     constraints = each("constraints", scenario.constraints, lambda form: make(form, ()))
-    names = [constraint.name for constraint in (*plant_constraints(links), *loops)]
+    names = [constraint.name for constraint in (*robots.plant_constraints(links), *loops)]
     for index, constraint in enumerate(constraints):
         with at(f"constraints.{index}"):  # Unknown names.
             if constraint.residual(links).numel() < len(constraint.force_signals):
@@ -145,7 +131,7 @@ def _checked_constraints(
             )
             warnings.warn(text, GeometryWarning, stacklevel=2)
     constraints += loops
-    bound = ConstraintSet([*constraints, *plant_constraints(links)])
+    bound = robots.ConstraintSet([*constraints, *robots.plant_constraints(links)])
     actuators = (*links.actuator_signals, *bound.motors)
     if not actuators and robot.actuators != []:
         text = (
@@ -159,16 +145,17 @@ def _checked_constraints(
     if links.actuator_signals:
         attached = each("actuation", scenario.actuation, lambda stage: stage.attach(links))
     with at("actuation"):
-        chain(scenario.actuation, links)
-    each("forces", forces or (), lambda f: force_rows(as_force_outputs([f], bound), bound, links))
+        robots.chain(scenario.actuation, links)
+    read = each("forces", forces or (), lambda f: robots.as_force_outputs([f], bound))
+    each("forces", read, lambda f: robots.force_rows(f, bound, links))
     with at("forces"):
-        as_force_outputs(forces, bound)
+        robots.as_force_outputs(forces, bound)
     for force in scenario.compliances or {}:
         with at(f"compliances.{force}"):
             bound.place(force)
     each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
     with at("law.control_weights"):
-        choice = control_choice(robot.title, scenario.law.control_weights or None, actuators)
+        choice = robots.control_choice(robot.title, scenario.law.control_weights or None, actuators)
     parts: tuple[Any, ...] = (links, *constraints, *robot.known_forces, *attached)
     parameters = [p.name for p in (*choice, *(p for part in parts for p in part.parameters))]
     for moving in scenario.exogenous:
@@ -302,5 +289,5 @@ def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> s
         # A start may be on the limit of a joint.
         if one.excess and abs(one.excess.value - one.excess.limit) > _SLACK:
             return str(one.excess)
-    behind = links_behind(model, motion.times, motion.states, motion.parameters)
+    behind = robots.links_behind(model, motion.times, motion.states, motion.parameters)
     return "; ".join(map(str, behind))

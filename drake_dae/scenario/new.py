@@ -3,7 +3,7 @@
 import os
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from math import ceil, log10, pi
@@ -18,7 +18,6 @@ from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
-    JacobianWrtVariable,
     Joint,
     PrismaticJoint,
     QuaternionFloatingJoint,
@@ -49,8 +48,13 @@ from drake_dae.scenario.form import at, dump_yaml
 from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
-from drake_dae.scenario.robot_file.changes import joints_of
-from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot, robot_links
+from drake_dae.scenario.robot_file.reading import (
+    finalize,
+    joints_of,
+    needs_of,
+    read_robot,
+    robot_links,
+)
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
@@ -58,21 +62,20 @@ SurfaceKind = Literal["plane", "cylinder", "sphere"]
 
 # Joints of grippers and wheels are locked, if others are left. A hand may be the link that the last
 # joint of an arm turns, a finger not. Frames at the end of an arm have these names, the best first.
-_NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
-_FINGER = re.compile(r"finger|thumb|jaw|knuckle|inner|outer", re.IGNORECASE)
-_TOOLS = [
-    re.compile(word, re.IGNORECASE)
-    for word in ("tcp", "tool", "end_?effector|eef|(^|_)ee(_|$)", "flange", "tip")
-]
+_NOT_OF_AN_ARM = re.compile(r"(?i)grip|finger|thumb|jaw|knuckle|hand|wheel|caster")
+_FINGER = re.compile(r"(?i)finger|thumb|jaw|knuckle|inner|outer")
+_TOOLS = ("tcp", "tool", "end_?effector|eef|(^|_)ee(_|$)", "flange", "tip")
 
 _ARM, _LONGEST_FINGER = 5, 4
 """Where a chain of so many joints branches into chains of at most so many, a hand begins."""
 
+_SHORT, _AT_AXIS = 3, 0.005
+"""The joints of a chain that needs its last one to move the tip; the distance in m below which a
+frame is at the axis of a joint."""
+
 # Walls around, a table, and a ceiling: axis of the normal, its sign, and the preference.
-_NORMALS = (
-    *((0, -1.0, 0.8), (0, 1.0, 0.6), (1, -1.0, 0.7), (1, 1.0, 0.6)),
-    *((2, 1.0, 1.0), (2, -1.0, 0.4)),
-)
+_WALLS = (0, -1.0, 0.8), (0, 1.0, 0.6), (1, -1.0, 0.7), (1, 1.0, 0.6)
+_NORMALS = (*_WALLS, (2, 1.0, 1.0), (2, -1.0, 0.4))
 
 _TRIES, _SLANTED = 40, 0.3
 """The postures that are tried for each normal; the weight of one with the tool not along it."""
@@ -131,10 +134,10 @@ def new_scenario(
     is_url = file.startswith("package://")
     with at("robot.file"):
         plant, robot = _read(file if is_url or not file else os.path.realpath(file))
-        robot, tip, last, why = _robot(plant, robot, tip)
+        robot, tip, chain, why = _chosen(plant, robot, tip)
     read = robot_links(robot, SceneGraph(), drawn=False)
     links, tried = read[0], list[str]()
-    if not any(point) and (far := _far_end(links, tip, last)):
+    if not any(point) and (far := _far_end(links, tip, chain)):
         point, why["point"] = far, "m, in that frame: its far end, where no frame of the file is"
     progress("looking for a place")
     found = list[tuple[float, Scenario, str]]()
@@ -170,26 +173,24 @@ def new_scenario(
 
 def _read(file: str) -> tuple[MultibodyPlant, Robot]:
     """The plant of a robot, with what must be left out of its file."""
-    robot = Robot(file, actuators="all")
+    robot, above = Robot(file, actuators="all"), [*Path(file).resolve().parents]
     with warnings.catch_warnings():  # The scenario's own robot reports it.
         warnings.simplefilter("ignore", RobotFileWarning)
         missing, lost = needs_of(robot)
-        above = [*Path(file).resolve().parents]
-        folders: dict[str, str] = {}  # Of unknown packages: above the file, or beside it.
-        for name in missing:
+        packages = dict[str, str]()
+        for name in missing:  # Above the file, or beside it.
             beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
             found = [*(folder for folder in above if folder.name == name), *beside]
-            folders.update({name: str(found[0])} if found else {})
+            packages.update({name: str(found[0])} if found else {})
         for more in ([], ["empty_limits"]):
-            robot = replace(robot, packages=folders, leave_out=[*lost, *more])
+            robot = replace(robot, packages=packages, leave_out=[*lost, *more])
             plant, loops = read_robot(robot)
             if any(map(_has_room, joints_of(plant))):
                 break
     if loops:
-        names = ", ".join(loop.options["name"] for loop in loops)
         raise ModelError(
-            f"joints close loops ({names}), and a new scenario has none; write one by hand, as the "
-            "shipped five_bar"
+            f"joints close loops ({', '.join(loops)}), and a new scenario has none; write one by "
+            "hand, as the shipped five_bar"
         )
     finalize(plant)
     return plant, robot
@@ -201,14 +202,10 @@ def _has_room(joint: Joint) -> bool:
     return one and bool(joint.position_upper_limits()[0] > joint.position_lower_limits()[0])
 
 
-def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, str, dict[str, str]]:
-    """The robot; the tip and the last joint that moves it; and key -> why it is so."""
-    why = {
-        "packages": "where package://<name>/ leads",
-        "leave_out": "what no equation has",
-        "actuators": "that are not locked",
-        "locked": "m or rad; all that is not of the chain, or mimics",
-    }
+def _chosen(
+    plant: MultibodyPlant, robot: Robot, tip: str
+) -> tuple[Robot, str, list[str], dict[str, str]]:
+    """The robot; the tip, and the joints that move it; and key -> why it is so."""
     # The base.
     joints, floating = joints_of(plant), QuaternionFloatingJoint | RpyFloatingJoint
     for joint in joints:
@@ -227,7 +224,7 @@ def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, s
             "holds one; copy two_arms_free_box, and write robot.base or robot.free"
         )
     if roots:
-        robot, why["base"] = replace(robot, base=RobotPlacement(roots[0])), "nothing holds it"
+        robot = replace(robot, base=RobotPlacement(roots[0]))
 
     # The chain: joints that can work, from the base to the tip.
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
@@ -250,37 +247,45 @@ def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, s
         chain = [joint for joint in path(body) if joint in works]
         if not chain:
             raise ModelError(f"no joint that turns or slides for itself moves the tip '{tip}'")
-        why["frame"] = f"moved by {len(chain)} joints"
+        why = f"moved by {len(chain)} joints"
     else:
         paths = {name: path(body) for name, body in body_of.items()}
         arms = [j for j in works if not _NOT_OF_AN_ARM.search(j.name())]
         arms = [j for j in arms if not _FINGER.search(j.child_body().name())]
-        chain = _longest(paths, arms) or _longest(paths, works)
+        chain = _longest([*paths.values()], arms) or _longest([*paths.values()], works)
         if not chain:
             mimics = f" (mimicking: {', '.join(sorted(coupled))})" if coupled else ""
             raise ModelError(
                 f"no joint turns or slides for itself{mimics}; write a scenario by hand, in which "
                 "robot.actuators names what is driven"
             )
-        tip = _tip(plant, chain, paths)
-        why["frame"] = f"the end of the longest chain, of {len(chain)} joints"
+        # The vendor's frame at its end, otherwise the outermost one.
+        context = plant.CreateDefaultContext()
+        origin = chain[-1].frame_on_child().CalcPoseInWorld(context).translation()
+        ends = [n for n, p in paths.items() if sum(j in chain for j in p) == len(chain)]
+        poses = {name: GetScopedFrameByName(plant, name).CalcPoseInWorld(context) for name in ends}
+        tools = [n for n in ends if not _FINGER.search(n)]
+        named = ([n for n in tools if re.search(word, n, re.IGNORECASE)] for word in _TOOLS)
+        best = next(filter(None, named), ends)
+        tip = max(best, key=lambda name: np.linalg.norm(poses[name].translation() - origin))
+        why = f"the end of the longest chain, of {len(chain)} joints"
 
     # All else is locked, at zero or the nearest limit; what mimics follows.
-    skipped = {names[joint.index()] for joint in chain} | {c.follower for c in couplings}
+    moving = [names[joint.index()] for joint in chain]
     locked = dict[str, float]()
     for joint in joints:
         is_simple = isinstance(joint, RevoluteJoint | PrismaticJoint)
-        if is_simple and (name := names[joint.index()]) not in skipped:
+        name = names.get(joint.index(), "")
+        if is_simple and name not in {*moving, *(c.follower for c in couplings)}:
             low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
             locked[name] = float(min(max(0.0, low), high))
-    return replace(robot, locked=locked), tip, names[chain[-1].index()], why
+    return replace(robot, locked=locked), tip, moving, {"frame": why}
 
 
-def _longest(paths: Mapping[str, list[Joint]], joints: Sequence[Joint]) -> list[Joint]:
+def _longest(paths: Sequence[Sequence[Joint]], joints: Sequence[Joint]) -> list[Joint]:
     """The longest chain of some joints, up to a hand."""
-    chains = [[joint for joint in path if joint in joints] for path in paths.values()]
-    every = [[joint for joint in path if _has_room(joint)] for path in paths.values()]
-    longest = max(chains, key=len, default=[])
+    longest = max(([j for j in path if j in joints] for path in paths), key=len, default=[])
+    every = [[joint for joint in path if _has_room(joint)] for path in paths]
     for count in range(_ARM, len(longest)):
         beyond = [c for c in every if c[:count] == longest[:count] and len(c) > count]
         branches = {int(chain[count].index()) for chain in beyond}
@@ -289,61 +294,31 @@ def _longest(paths: Mapping[str, list[Joint]], joints: Sequence[Joint]) -> list[
     return longest
 
 
-def _tip(plant: MultibodyPlant, chain: Sequence[Joint], paths: dict[str, list[Joint]]) -> str:
-    """The vendor's frame at the end of a chain, otherwise the outermost one."""
-    context = plant.CreateDefaultContext()
-    origin = chain[-1].frame_on_child().CalcPoseInWorld(context).translation()
-    distances = {}
-    for name, path in paths.items():
-        if sum(joint in chain for joint in path) == len(chain):
-            pose = GetScopedFrameByName(plant, name).CalcPoseInWorld(context)
-            distances[name] = float(np.linalg.norm(pose.translation() - origin))
-    named = ([n for n in distances if word.search(n) and not _FINGER.search(n)] for word in _TOOLS)
-    return max(next(filter(None, named), distances), key=lambda name: distances[name])
-
-
-def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
-    """The far end of a link whose frame is at the axis of the joint that turns it, in m.
+def _far_end(links: MultibodyExpressions, tip: str, chain: Sequence[str]) -> Vector | None:
+    """The far end, in m, of a link whose frame is at the axis of the joint that turns it.
 
     It is the middle of the face of the box around the link that is farthest from the joint; without
     geometry it is beyond the center of mass, at the end of an equivalent rod. None if the frame is
-    elsewhere, or all these are at the axis.
+    elsewhere, or if more joints move it: a wrist may roll about an axis through the tool.
     """
-    plant, context = links.plant, links.plant.CreateDefaultContext()
-    frame, joint = GetScopedFrameByName(plant, tip), joint_names(plant)[last]
-    if not isinstance(joint, RevoluteJoint):
+    plant = links.plant
+    frame, joint = GetScopedFrameByName(plant, tip), joint_names(plant)[chain[-1]]
+    if len(chain) > _SHORT or not isinstance(joint, RevoluteJoint):
         return None
-    body = frame.body()
+    body, context = frame.body(), plant.CreateDefaultContext()
     pose = joint.frame_on_child().CalcPose(context, body.body_frame())
     origin, axis = pose.translation(), pose.rotation() @ joint.revolute_axis()
-    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-    origins = [plant.EvalBodyPoseInWorld(context, one).translation() for one in bodies]
-    near = 0.01 * float(np.linalg.norm(np.ptp(origins, axis=0)))
 
     def distance(place: FloatArray) -> float:
         return float(np.linalg.norm(np.cross(axis, place - origin)))
 
-    if distance(frame.GetFixedPoseInBodyFrame().translation()) > near:
-        return None
-    # A wrist may roll about an axis through the tool, if the joints before it move that anywhere.
-    step = np.random.default_rng(0).uniform(-1.0, 1.0, plant.num_positions())
-    plant.SetPositions(context, plant.GetPositions(context) + step)
-    world, wrt = plant.world_frame(), JacobianWrtVariable.kV
-    J = plant.CalcJacobianTranslationalVelocity(context, wrt, frame, np.zeros(3), world, world)
-    if np.linalg.matrix_rank(J, tol=1e-6) >= min(3, J.shape[1]):
-        return None
-    choices = [[2.0 * body.default_com() - origin]] if body.default_mass() > 0.0 else []
-    points = [o.points for o in links.outlines if o.name == body.name() and len(o.points) > 1]
-    if points:
+    places = [2.0 * body.default_com() - origin]
+    if points := [o.points for o in links.outlines if o.name == body.name() and len(o.points) > 1]:
         low, high = np.vstack(points).min(axis=0), np.vstack(points).max(axis=0)
         sides = product(np.eye(3, dtype=bool), (low, high))
-        choices.insert(0, [np.where(row, side, (low + high) / 2) for row, side in sides])
-    for places in choices:
-        farthest = max(places, key=distance)
-        if distance(farthest) > near:
-            x, y, z = (float(value) + 0.0 for value in np.round(farthest, 4))
-            return (x, y, z)
-    return None
+        places = [np.where(row, side, (low + high) / 2) for row, side in sides]
+    far, near = max(places, key=distance), frame.GetFixedPoseInBodyFrame().translation()
+    return _rounded(far, 4) if distance(near) < _AT_AXIS < distance(far) else None
 
 
 class _Place(NamedTuple):
@@ -351,12 +326,13 @@ class _Place(NamedTuple):
 
     center: Vector  # m
     normal: Vector
-    ways: tuple[int, ...]
+    ways: Sequence[int]
     positions: dict[str, float]  # Of the joints, in m and rad.
     why: str
     speed: float  # The largest one within the limits of joints, m/s.
     force: float  # Likewise, N.
     size: float  # Of the robot, m.
+    digits: int  # Of places in m, as they are written.
 
 
 def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place]:
@@ -366,9 +342,8 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
     good if the task's directions are independent, joints are away from their limits, all bodies are
     on the free side, the base is beside the tip, and gravity takes less than half of the torques.
     """
-    column, sign_out = tool_axis(
-        links, PointOnSurface(tip, Plane((0, 0, 0), (0, 0, 1)), point).touch(links)
-    )
+    touch = PointOnSurface(tip, Plane((0, 0, 0), (0, 0, 1)), point).touch(links)
+    column, sign_out = tool_axis(links, touch)
     R, place = links.rotation(tip), links.position(tip, point)
     # The tip's position, and of each axis of the world the two components across the tool.
     across = [k for k in range(3) if k != column]
@@ -387,6 +362,7 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
     efforts[np.argmax(np.abs(links.actuation_matrix), axis=0)] = links.effort_limits
     efforts = np.where(efforts > 0.0, efforts, np.inf)
     guesses, size = postures.guesses(_TRIES), postures.size
+    digits = 2 if size > 0.3 else 3
 
     def seen(q: FloatArray, factor: float) -> tuple[Posture, list[FloatArray], float]:
         return postures.at(q), [value.full() for value in function(q, values)], factor
@@ -419,17 +395,19 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
                 score, best, rows_at = quality, posture, chosen
         if not rows_at:
             continue
-        free = tuple(row for row in rows_at if row in ways)
+        free = [row for row in rows_at if row in ways]
         inverse = np.linalg.pinv(best.gradients[rows_at])[:, 1 : 1 + len(free)]
         speed = _SHARE / np.max(np.abs(inverse) / speeds[:, None], initial=1e-9)
         force = _SHARE / 2 / np.max(np.abs(best.gradients[axis]) / efforts, initial=1e-9)
         count, share = len(rows_at), score / len(rows_at)
-        ways_out = f"{count} directions of motion are free of each other there by {share:.2g}"
-        i, j, k = (sign * (n == axis) + 0.0 for n in range(3))
-        values_at = (np.round(best.q, 4) + 0.0).tolist()
-        near = dict(zip((s.name for s in links.position_signals), values_at, strict=True))
-        why, center = f"where {ways_out} (1 is best, 0 singular)", _rounded(best.rows[:3], size)
-        placed = _Place(center, (i, j, k), free, near, why, speed, force, size)
+        why = (
+            f"where {count} directions of motion are free of each other there by {share:.2g} "
+            "(1 is best, 0 singular)"
+        )
+        names = (signal.name for signal in links.position_signals)
+        near = dict(zip(names, (np.round(best.q, 4) + 0.0).tolist(), strict=True))
+        center, normal = _rounded(best.rows[:3], digits), _rounded(sign * np.eye(3)[axis], 0)
+        placed = _Place(center, normal, free, near, why, speed, force, size, digits)
         found.append((score * preference, placed))
     return [placed for _, placed in sorted(found, key=lambda entry: -entry[0])]
 
@@ -438,27 +416,28 @@ def _scenario(
     robot: Robot, tip: str, point: Vector, place: _Place, kind: SurfaceKind, fraction: float
 ) -> Scenario:
     """A circle at a place, or a line, with a fraction of the usual radius and force."""
-    center, normal, size, ways = place.center, np.array(place.normal), place.size, place.ways
-    radius = _round_number(fraction * _RADIUS * size)
+    center, normal, ways = place.center, np.array(place.normal), place.ways
+    radius = _round_number(fraction * _RADIUS * place.size)
     period = max(_SHORTEST, float(ceil(2 * pi * radius / place.speed)))
-    axis, (bend, _, _) = int(np.argmax(np.abs(normal))), _rounded([_BEND * size] * 3, size)
-    middle = _rounded(center - bend * normal, size)
-    flat = ("ceiling" if normal[2] < 0.0 else "table") if axis == 2 else "wall"
+    axis, bend = int(np.argmax(np.abs(normal))), float(np.round(_BEND * place.size, place.digits))
+    middle = _rounded(center - bend * normal, place.digits)
     # A planar robot moves around the cylinder, others also along it.
     along = np.eye(3)[ways[-1] if len(ways) > 1 else 3 - axis - ways[0]].tolist()
+    flat = ("ceiling" if normal[2] < 0.0 else "table") if axis == 2 else "wall"
     surfaces: dict[str, tuple[str, Surface]] = {
         "plane": (flat, Plane(center, place.normal)),
         "sphere": ("ball", Sphere(middle, bend)),
         "cylinder": ("pipe", Cylinder(middle, along, bend)),
     }
     name, surface = surfaces[kind]
-    begin = [center[way] for way in ways]
+    shape, begin = "line", [center[way] for way in ways]
     path: Reference = SinusoidReference(begin[0], [radius], [round(2 * pi / period, 4)])
     if len(ways) > 1:
-        path = CircleReference(begin, radius, period=period)
-    shape, stem = "circle" if len(ways) > 1 else "line", Path(robot.file).name.split(".")[0]
+        shape, path = "circle", CircleReference(begin, radius, period=period)
     return Scenario(
-        description=f"{stem} draws a {shape} on a {name} and presses on it",
+        description=(
+            f"{Path(robot.file).name.split('.')[0]} draws a {shape} on a {name} and presses on it"
+        ),
         robot=robot,
         constraints=[PointOnSurface(tip, surface, point, name)],
         # On a strongly curved surface an axis fixed to the normal hinders motion along it.
@@ -472,9 +451,9 @@ def _scenario(
     )
 
 
-def _rounded(values: FloatArray | list[float], size: float) -> Vector:
-    """A place in m as it is written, for a robot of a size, without -0."""
-    x, y, z = (float(value) + 0.0 for value in np.round(values, 2 if size > 0.3 else 3))
+def _rounded(values: FloatArray, digits: int) -> Vector:
+    """A place as it is written, without -0."""
+    x, y, z = (float(value) + 0.0 for value in np.round(values, digits))
     return (x, y, z)
 
 
@@ -490,13 +469,17 @@ def _text(scenario: Scenario, why: dict[str, str], folder: str | Path | None) ->
     file = Path(data["robot"]["file"])
     if folder is not None and file.is_relative_to(saved := os.path.realpath(folder)):
         data["robot"]["file"] = file.relative_to(saved).as_posix()
-    force = "N, at most 20, and a sixth of what efforts allow"
     why = {
+        "packages": "where package://<name>/ leads",
+        "leave_out": "what no equation has",
+        "base": "nothing holds it",
+        "actuators": "that are not locked",
+        "locked": "m or rad; all that is not of the chain, or mimics",
         **why,
         "tool_axis": "kept where it starts",
         "positions": "near there, in rad or m",
         "duration": "s, two rounds",
-        f"{scenario.constraints[0].name}.force": force,
+        f"{scenario.constraints[0].name}.force": "N, at most 20, and a sixth of what efforts allow",
     }
     lines = [
         "# Written by `drake-dae new`, to be changed. Units: m, rad, s, N, N m.",

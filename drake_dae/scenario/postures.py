@@ -11,22 +11,21 @@ from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.tree import WeldJoint
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.contacts import critical_factor
 from drake_dae.errors import ModelError
 from drake_dae.robots import ConstraintSet, LinkDepths, Links, LoopState, Touch
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.numerics import NewtonModel, newton, shortest_steps
+from drake_dae.trace.numerics import newton, shortest_steps
 
 INDEPENDENT = 0.02
 """Rows with an `independence` below this are dependent or nearly so."""
 
-EXACT = 1e-9
+_EXACT = 1e-9
 """The allowed residual of equations in m, rad or 1."""
 
-NEAR_LIMIT = 0.1
-"""A joint within this fraction of its range from a limit counts as close to it."""
-
-_NEWTON_STEPS = 25
-"""The largest number of Newton steps from a guess; a good guess takes six."""
+_NEAR_LIMIT, _NEWTON_STEPS = 0.1, 25
+"""A joint within this fraction of its range from a limit is close to it; the largest number of
+Newton steps from a guess: a good one takes six."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +52,8 @@ class Posture:
         """
         of_rows, of_forces = self._control
         B = np.vstack([of_rows[list(rows)], of_forces])
-        if len(B) > B.shape[1]:
-            return 0.0
-        return float(np.min(np.linalg.svd(B, compute_uv=False), initial=1.0))
+        regular = len(B) <= B.shape[1]
+        return float(np.min(np.linalg.svd(B, compute_uv=False), initial=1.0)) if regular else 0.0
 
     @cached_property
     def _control(self) -> tuple[FloatArray, FloatArray]:
@@ -81,8 +79,9 @@ class Posture:
         """
         J, normal = self.gradients[list(rows)], self.normals[contact]
         A_n = J @ np.linalg.solve(self.mass, J.T @ normal)
-        A_nn = float(normal @ A_n)
-        return A_nn / max(float(np.linalg.norm(A_n - A_nn * normal)), 1e-9 * A_nn)
+        A_nn = normal @ A_n
+        A_nt = float(np.linalg.norm(A_n - A_nn * normal))
+        return critical_factor(np.array([[A_nn]]), np.array([[A_nt]]), [0])
 
     def independent(self, rows: Sequence[int], more: Iterable[int], count: int) -> list[int]:
         """The first rows of `more`, at most `count`, independent of `rows` and of each other."""
@@ -91,14 +90,6 @@ class Posture:
             if len(chosen) < count and self.independence([*rows, *chosen, row]) > INDEPENDENT:
                 chosen.append(row)
         return chosen
-
-    def most_independent(self, rows: Sequence[int], more: Sequence[int], count: int) -> list[int]:
-        """`count` rows of `more`, each the most independent of those before it."""
-        chosen: list[int] = []
-        for _ in range(count):
-            rest = [row for row in more if row not in chosen]
-            chosen.append(max(rest, key=lambda row: self.independence([*rows, *chosen, row])))
-        return sorted(chosen)
 
 
 class Postures:
@@ -137,6 +128,7 @@ class Postures:
             "leans": ca.vertcat(ca.SX(0, 1), *[ca.dot(t.normal, axis) for t, axis in touches]),
         }
         self._shapes = {name: value.shape for name, value in outputs.items()}
+        self._shapes |= {"rows": (-1,), "leans": (-1,)}
         self._function = TracedFunction("postures", inputs, outputs)
         by_place = {str(place): touch for place, (touch, _) in enumerate(touches)}
         self._depths = LinkDepths(links, by_place, inputs["parameters"])
@@ -158,8 +150,6 @@ class Postures:
         """The posture of a configuration."""
         values = zip(self._shapes.items(), self._function(q, self._parameters), strict=True)
         shaped = {name: value.reshape(shape) for (name, shape), value in values}
-        for name in ("rows", "leans"):
-            shaped[name] = shaped[name].ravel()
         depths = self._depths.at(q, self._parameters).values()
         depth = max((float(np.max(of_links)) for of_links in depths), default=0.0)
         return Posture(q=q, depth=depth, **shaped)
@@ -169,16 +159,12 @@ class Postures:
     ) -> FloatArray | None:
         """A configuration on the constraints in which some rows have given values, near a guess."""
         residual, slopes = self._residual(rows, wanted)
-
-        def linearize(q: FloatArray) -> NewtonModel | None:
-            return shortest_steps(slopes(q), residual)
-
-        q = newton(guess, linearize, _NEWTON_STEPS)[0]
+        q = newton(guess, lambda q: shortest_steps(slopes(q), residual), _NEWTON_STEPS)[0]
         is_fine = (self._room(q) >= 0.0) & np.isfinite(self.high - self.low)
         near = unwound(q, np.zeros(q.size), (self.low, self.high), self._turns & ~is_fine)
         for found in (near, q):  # Where a row is the position of a joint, turns matter.
             left = np.max(np.abs(residual(found)), initial=0.0)
-            if left < EXACT and np.all(self._room(found) >= -EXACT):
+            if left < _EXACT and np.all(self._room(found) >= -_EXACT):
                 return found
         return None
 
@@ -195,12 +181,10 @@ class Postures:
         def weighted(q: FloatArray) -> FloatArray:
             return np.nan_to_num(weights * residual(q), nan=1e6, posinf=1e6, neginf=-1e6)
 
-        def gradient(q: FloatArray) -> FloatArray:
-            return weights[:, None] * slopes(q)
-
         inside = [np.clip(q, low, high) for q in guesses]
         tried = sorted(inside, key=lambda q: float(np.sum(weighted(q) ** 2)))[:3]
-        fits = [least_squares(weighted, q, gradient, (low, high), max_nfev=50) for q in tried]
+        gradient, bounds = lambda q: weights[:, None] * slopes(q), (low, high)
+        fits = [least_squares(weighted, q, gradient, bounds, max_nfev=50) for q in tried]
         q = min(fits, key=lambda fit: float(fit.cost)).x
         return q, residual(q)[: self._count]
 
@@ -225,7 +209,7 @@ class Postures:
         """1 if no joint is close to a limit, 0 if one is at it or beyond."""
         span = self.high - self.low
         bounded = np.isfinite(span) & (span > 0.0)
-        share = self._room(q)[bounded] / (NEAR_LIMIT * span[bounded])
+        share = self._room(q)[bounded] / (_NEAR_LIMIT * span[bounded])
         return float(np.clip(np.min(share, initial=1.0), 0.0, 1.0))
 
     def quality(self, posture: Posture, rows: Sequence[int]) -> float:
@@ -250,7 +234,7 @@ class Postures:
         low, high = np.maximum(self.low, -reach), np.minimum(self.high, reach)
         empty = low > high  # Limits wider than a turn.
         low, high = np.where(empty, self.low, low), np.where(empty, self.high, high)
-        inset = 0.5 * NEAR_LIMIT * (high - low)
+        inset = 0.5 * _NEAR_LIMIT * (high - low)
         return random.uniform(low + inset, high - inset, (count, low.size))
 
 
@@ -279,12 +263,11 @@ def tool_axis(links: Links, touch: Touch) -> tuple[int, float]:
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     above = {joint.child_body().index(): joint for joint in joints}
     body = frame.body()
-    while isinstance(above.get(body.index()), WeldJoint):
-        body = above[body.index()].parent_body()
-    joint = above.get(body.index())
-    origin = body.body_frame() if joint is None else joint.frame_on_child()
-    context = plant.CreateDefaultContext()
-    offset = np.array(touch.point) - origin.CalcPose(context, frame).translation()
+    while isinstance(joint := above.get(body.index()), WeldJoint):
+        body = joint.parent_body()
+    origin = joint.frame_on_child() if joint else body.body_frame()
+    pose = origin.CalcPose(plant.CreateDefaultContext(), frame)
+    offset = np.array(touch.point) - pose.translation()
     largest = int(np.argmax(np.abs(offset)))
     if abs(offset[largest]) < 1e-6:
         return 2, 1.0

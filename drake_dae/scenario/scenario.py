@@ -24,17 +24,7 @@ from drake_dae.arrays import listed, unknown_name
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.files import read_text
 from drake_dae.references import Reference
-from drake_dae.robots import (
-    Constraint,
-    ForceOutput,
-    Load,
-    PositionOutput,
-    Stage,
-    Surface,
-    SurfaceCoordinates,
-    TiltFromNormal,
-    WeldedFrames,
-)
+from drake_dae.robots import Constraint, ForceOutput, Load, PositionOutput, Stage, Surface
 from drake_dae.running.simulate import check_config
 from drake_dae.scenario import form, parts
 from drake_dae.scenario.form import Family, Key, Positive, Reader, keys_of
@@ -67,7 +57,7 @@ class WeldedFramesForm:
     def make(self, constraints: Sequence[Constraint]) -> Constraint:
         rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
         pose = RigidTransform(rotation, self.pose.translation)
-        return WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
+        return robots.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
 
 
 @dataclass(frozen=True)
@@ -81,7 +71,7 @@ class SurfaceCoordinatesForm:
     constraint: str
 
     def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
-        return SurfaceCoordinates(_named(self.constraint, constraints))
+        return robots.SurfaceCoordinates(_named(self.constraint, constraints))
 
 
 @dataclass(frozen=True)
@@ -99,7 +89,8 @@ class TiltFromNormalForm:
     components: str = ""
 
     def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
-        return TiltFromNormal(_named(self.constraint, constraints), self.axis, self.components)
+        named = _named(self.constraint, constraints)
+        return robots.TiltFromNormal(named, self.axis, self.components)
 
 
 WrittenConstraint = Constraint | WeldedFramesForm

@@ -27,8 +27,41 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     start, plant.parameters, integrator, numbers of gains and seeds may differ from the loop's.
     """
     context, plant, controller = loop.diagram.CreateDefaultContext(), loop.plant, loop.controller
-    _set_numbers(scenario, loop, context)
-    model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
+    at_plant, of_plant = plant.GetMyMutableContextFromRoot(context), scenario.plant
+
+    # The numbers that `start` does not give.
+    begin = scenario.integrator.start_time
+    if begin < 0.0 and (plant.time_step or scenario.sampling):
+        text = "steps and samples begin at 0 s in Drake, and a run with them no earlier"
+        raise ScenarioError(("integrator.start_time", f"{text}, got {begin:g} s"))
+    context.SetTime(begin)
+    numbers = dict[str, dict[str, ArrayLike]]()
+    if not of_plant.carries:
+        pushes = enumerate(of_plant.disturbances)
+        numbers["plant.parameters"] = dict(of_plant.parameters)
+        numbers["plant.payloads"] = {f"{p.name}.mass": p.mass for p in of_plant.payloads}
+        numbers["plant.disturbances"] = {f"plant_disturbance_{i}.force": d.force for i, d in pushes}
+    parameters = plant.parameters(at_plant)
+    for key, values in numbers.items():
+        with at(key):
+            for name, value in values.items():
+                # A user's own plant may not let numbers be set, and has been made with these.
+                if not np.array_equal(parameters[plant.dae.parameter_slice(name)], np.ravel(value)):
+                    plant.set_parameter(at_plant, name, value)
+    with at("plant"):
+        of_plant.begin(plant, at_plant)
+    force, encoders, gains = scenario.sensors.force, scenario.sensors.encoders, scenario.law.gains
+    if loop.sensor is not None and force is not None:
+        with at("sensors.force"):
+            at_sensor = loop.sensor.GetMyMutableContextFromRoot(context)
+            loop.sensor.set_errors(at_sensor, force.bias, force.noise_deviation, force.drift)
+    if gains is not None and not controller.takes_over:
+        with at("law.gains"):
+            controller.set_gains(controller.GetMyMutableContextFromRoot(context), gains.design())
+    loop.set_seed(context, force.seed if force else 0, encoders.seed if encoders else None)
+
+    # The state.
+    model = plant.robot("a scenario")
     parameters, count = plant.current_parameters(at_plant), len(model.position_signals)
     forces, nq = np.zeros(model.dae.num_outputs - count), model.links.q.numel()
     is_steered = not controller.takes_over and model.dae.num_controls > 0
@@ -40,10 +73,8 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
                 with at("start.errors"):
                     index = _index_of(name, plant.dae.output_signals, "output")
                     if law.degrees[index] == 0:
-                        raise ModelError(
-                            f"'{name}' has degree 0: the law meets it at once and it has no start "
-                            "error"
-                        )
+                        text = "has degree 0: the law meets it at once and it has no start error"
+                        raise ModelError(f"'{name}' {text}")
                 outputs[index] += error
             # The law assumes its own values of parameters; exogenous ones are measured.
             sizes, of_law = {p.name: p.value.size for p in law.system.parameters}, parameters.copy()
@@ -68,44 +99,9 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
                     moving[nq + _index_of(name, model.links.velocity_signals, "velocity")] = value
             plant.set_consistent_state(at_plant, moving, [*scenario.start.velocities])
     if loop.sensor is not None:
-        force = model.rest_forces(state[:nq], forces, parameters)
-        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
+        _, rest, _ = model.balance.rest(state[:nq], forces, parameters)
+        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), rest)
     return context
-
-
-def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
-    """Sets all numbers of a context of a closed loop but those that `start` gives."""
-    plant, controller, begin = loop.plant, loop.controller, scenario.integrator.start_time
-    if begin < 0.0 and (plant.time_step or scenario.sampling):
-        text = "steps and samples begin at 0 s in Drake, and a run with them no earlier"
-        raise ScenarioError(("integrator.start_time", f"{text}, got {begin:g} s"))
-    context.SetTime(begin)
-    at_plant, of_plant = plant.GetMyMutableContextFromRoot(context), scenario.plant
-    numbers = dict[str, dict[str, ArrayLike]]()
-    if not of_plant.carries:
-        pushes = enumerate(of_plant.disturbances)
-        numbers["plant.parameters"] = dict(of_plant.parameters)
-        numbers["plant.payloads"] = {f"{p.name}.mass": p.mass for p in of_plant.payloads}
-        numbers["plant.disturbances"] = {f"plant_disturbance_{i}.force": d.force for i, d in pushes}
-    before = plant.parameters(at_plant)
-    for key, values in numbers.items():
-        with at(key):
-            for name, value in values.items():
-                # A user's own plant may not let numbers be set, and has been made with these.
-                if not np.array_equal(before[plant.dae.parameter_slice(name)], np.ravel(value)):
-                    plant.set_parameter(at_plant, name, value)
-    with at("plant"):
-        of_plant.begin(plant, at_plant)
-    force, encoders, gains = scenario.sensors.force, scenario.sensors.encoders, scenario.law.gains
-    if loop.sensor is not None and force is not None:
-        with at("sensors.force"):
-            at_sensor = loop.sensor.GetMyMutableContextFromRoot(context)
-            loop.sensor.set_errors(at_sensor, force.bias, force.noise_deviation, force.drift)
-    if gains is not None and not controller.takes_over:
-        with at("law.gains"):
-            controller.set_gains(controller.GetMyMutableContextFromRoot(context), gains.design())
-    seed = 0 if force is None else force.seed
-    loop.set_seed(context, seed, None if encoders is None else encoders.seed)
 
 
 def _at_rest(
@@ -116,14 +112,14 @@ def _at_rest(
     parameters: FloatArray,
 ) -> FloatArray:
     """The state at rest at start.positions, or next to them on the constraints."""
-    structure, guess = loop.controller.start_structure, start_guess(scenario, model.links)
+    structure = loop.controller.start_structure
     of_law = structure.system.parameters_of(loop.plant.dae, parameters)
 
     def settled(near: FloatArray) -> FloatArray:
         rest = model.rest_state(near, forces, parameters)
         return structure.manifold.settle(rest, of_law)[: near.size]
 
-    q = _within_limits(model, settled, guess, "Give")
+    q = _within_limits(model, settled, start_guess(scenario, model.links))
     state = model.rest_state(q, forces, parameters)
     if scenario.exogenous and not structure.manifold.is_consistent(state, of_law):
         raise ModelError(
@@ -190,8 +186,7 @@ def start_state(
     # By default near the start of the completion.
     guess = start_guess(scenario, model.links, model.nominal_positions)
     try:
-        remedy = "Change the first values of the references, or give"
-        q = _within_limits(model, solve, guess, remedy)
+        q = _within_limits(model, solve, guess)
     except InconsistentStateError as error:
         goal = ", ".join(
             f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
@@ -205,7 +200,7 @@ def start_state(
 
 
 def _within_limits(
-    model: RobotModel, solve: Callable[[FloatArray], FloatArray], guess: FloatArray, remedy: str
+    model: RobotModel, solve: Callable[[FloatArray], FloatArray], guess: FloatArray
 ) -> FloatArray:
     """A solution near a guess without the whole turns that Newton's method may add to joints."""
     signals, (low, high) = model.links.position_signals, model.links.position_limits
@@ -223,8 +218,9 @@ def _within_limits(
     ]
     if outside:
         raise ModelError(
-            f"the robot cannot start outside of its limits, and the start near start.positions has "
-            f"{'; '.join(outside)}. {remedy} start.positions of all joints near where they shall be"
+            f"the robot cannot start outside of its limits, but near start.positions is "
+            f"{'; '.join(outside)}. Give start.positions of all joints near where they shall be, "
+            "or change the first values of the references"
         )
     return q
 

@@ -14,7 +14,6 @@ from .controller import TrackingController as TrackingController
 from .estimator import StateEstimator as StateEstimator
 from .ideal_plants import DaePlant as DaePlant
 from .ideal_plants import RobotPlant as RobotPlant
-from .opening_contact import open_contact as open_contact
 from .phases import Approach as Approach
 from .phases import Condition as Condition
 from .phases import Dwell as Dwell
@@ -31,4 +30,5 @@ from .sensors import Encoders as Encoders
 from .sensors import ForceSensor as ForceSensor
 from .sensors import StateSensor as StateSensor
 from .task import Task as Task
+from .task import open_contact as open_contact
 from .task_controller import TaskController as TaskController

@@ -18,7 +18,7 @@ from drake_dae.errors import ModelError, NonFiniteError, WiringError
 
 _SAME = 1e-9  # Times that differ by less than this, in periods, count as equal.
 
-MOST_ON_THE_WAY = 10_000  # computations in progress: each is stored, and shifted at every sample
+_MOST = 10_000  # computations on the way: each is stored, and shifted at every sample
 
 
 @checked(ModelError)
@@ -40,11 +40,9 @@ class Sampling:
 
     def __post_init__(self) -> None:
         positive("a sampling's period", self.period)
-        most = MOST_ON_THE_WAY * self.period
-        if not 0.0 <= self.delay <= most:
+        if not 0.0 <= self.delay <= _MOST * self.period:
             raise ModelError(
-                f"a sampling's delay must be from 0 to {MOST_ON_THE_WAY} periods, here {most:g} s, "
-                f"got {self.delay:g} s"
+                f"a sampling's delay must be from 0 to {_MOST} periods, got {self.delay:g} s"
             )
 
     @property

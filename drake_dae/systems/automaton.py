@@ -16,10 +16,9 @@ from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.references import ConstantReference
 from drake_dae.references.by_name import assign, in_order
 from drake_dae.systems.controller import SIGNAL, law_block
-from drake_dae.systems.opening_contact import CONTACT, FREE, OpeningContact
 from drake_dae.systems.phases import Moment
 from drake_dae.systems.references import traced_references
-from drake_dae.systems.task import Task
+from drake_dae.systems.task import CONTACT, FREE, OpeningContact, Task
 
 CHANGE = (
     *(Signal("number of changes"), Signal("phase"), Signal("in contact"), Signal("start", "s")),

@@ -97,8 +97,8 @@ class ContactTerms:
 class Contacts:
     """The contacts of a robot at a sample, as expressions.
 
-    `period` and `delay` are T and the `control_delay`; an ideal contact has the friction of the
-    model at small speeds, too; `deviations` are those of measured positions, shape (k,).
+    An ideal contact has the friction of the model at small speeds, too; `deviations` are those of
+    measured positions, shape (k,).
     """
 
     def __init__(

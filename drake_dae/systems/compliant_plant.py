@@ -11,24 +11,23 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.block import Block, Held, Requirement
+from drake_dae.blocks.block import Block, Held, Requirement, stacked
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae import ConstraintStructure, Signal, constraint_structure_of
+from drake_dae.dae import ConstraintStructure, Signal, find_constraint_structure, structure_of
 from drake_dae.errors import ModelError
 from drake_dae.robots import RobotModel
-from drake_dae.systems.contact_forces import contact_force_signals
 from drake_dae.systems.contact_laws import (
     PointContact,
     ball_normals,
     contact_force,
+    contact_force_signals,
     contact_step,
     point_contacts,
     touching,
 )
 from drake_dae.systems.contact_material import FRICTION, PointMaterial
 from drake_dae.systems.ideal_plants import joint_outputs
-from drake_dae.systems.parameterized import ParameterizedSystem, changed_parameters
-from drake_dae.systems.plant import Plant, port_signals
+from drake_dae.systems.plant import ParameterizedSystem, Plant, changed_parameters, port_signals
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import FailureKind, TracedFunction
 
@@ -97,7 +96,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
         dae, count = model.dae, len(model.constraints)
         values = dae.parameter_vector(changed_parameters(model, parameters or {}))
         self.model: RobotModel = model
-        self.structure = constraint_structure_of(type(self).__name__, dae, structure)
+        self.structure = structure_of(dae, structure, find_constraint_structure)
         self.time_step, self.material = material.time_step, material
         self._checked_step = np.zeros(0)
         numbers, normals = ca.SX.sym("material", 4), ca.SX.sym("normals", 3 * count)
@@ -116,7 +115,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
-        return {"contact_force": self.contact_force_signals}
+        return {"contact_force": self.block.signals["contact_force"]}
 
     @property
     def further_parameters(self) -> Mapping[str, tuple[Signal, int]]:
@@ -147,7 +146,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
             return
         self.check_context(context)
         context.SetDiscreteState(0, self.dae.state_vector(state))
-        context.SetDiscreteState(1, np.zeros(len(self.contact_force_signals)))
+        context.SetDiscreteState(1, np.zeros(3 * len(self.model.constraints)))
 
     @checked(ModelError)
     def set_contact(self, context: Context, material: PointMaterial) -> None:
@@ -158,11 +157,11 @@ class CompliantPlant(ParameterizedSystem, Plant):
         stiction_tolerance than the plant, or a friction although that has none; that a ball does
         not fit its surface; or that the step does not fit the stages.
         """
-
-        def fixed(given: PointMaterial) -> tuple[float, float, bool]:
-            return given.time_step, given.stiction_tolerance, given.friction is None
-
-        if fixed(material) != fixed(self.material):
+        fixed, wanted = (
+            (given.time_step, given.stiction_tolerance, given.friction is None)
+            for given in (self.material, material)
+        )
+        if fixed != wanted:
             raise ModelError(
                 f"{self.dae.name}: the plant was made with {self.material}; only its stiffness, "
                 f"dissipation, radius and a number of its friction may change, got {material}"
@@ -189,11 +188,6 @@ class CompliantPlant(ParameterizedSystem, Plant):
                 )
         return parameters
 
-    @property
-    def contact_force_signals(self) -> Sequence[Signal]:
-        """Names and units of `contact_force`."""
-        return self.block.signals["contact_force"]
-
 
 def compliant_block(
     model: RobotModel,
@@ -207,9 +201,14 @@ def compliant_block(
     control, force = ca.SX.sym("u", dae.num_controls), ca.SX.sym("F", len(names))
     if period:
         advanced, slack = _step(model, contacts, control, period)
-    else:
+    else:  # x'
         force = ca.vertcat(*(contact_force(contact, model.links.v) for contact in contacts))
-        advanced, slack = _rate(model, contacts, control, force)
+        mass, forces = _balance(model, control)
+        jacobian = ca.vertcat(*(contact.jacobian for contact in contacts))
+        change = PositiveDefiniteFactorization(mass).solve(forces + ca.mtimes(jacobian.T, force))
+        velocity = ca.mtimes(model.links.velocity_map, model.links.v)
+        advanced = ca.vertcat(velocity, change, stage_rates(model, control))
+        slack = _within_limits(model, model.links.q)
     fits = Requirement(slack, OUTSIDE, FailureKind.OUTSIDE)
     advanced = fits.of(advanced)
     normals = ca.horzcat(*(touch.normal for _, touch in touching(model)))
@@ -249,16 +248,10 @@ def _balance(model: RobotModel, control: ca.SX) -> tuple[ca.SX, ca.SX]:
     dae, links = model.dae, model.links
     nq, nv = links.q.numel(), links.v.numel()
     part = slice(nq, nq + nv)
-    viscous = [
-        parameter.symbol
-        for constraint in model.constraints
-        for parameter in constraint.parameters
-        if parameter.name == f"{constraint.name}.viscous_friction"
-    ]
     # Viscous friction belongs to the contacts here.
-    forces = dae.f[part]
-    if viscous:
-        forces = ca.substitute(forces, ca.vertcat(*viscous), ca.DM.zeros(len(viscous)))
+    parameters = (p for constraint in model.constraints for p in constraint.parameters)
+    viscous = [p.symbol for p in parameters if p.name.endswith(".viscous_friction")]
+    forces = ca.substitute(dae.f[part], stacked(viscous), ca.DM.zeros(len(viscous)))
     limits = ca.DM(links.effort_limits)
     torque = control if model.joint_force is None else model.joint_force
     within = ca.fmin(ca.fmax(torque, -limits), limits)
@@ -266,19 +259,6 @@ def _balance(model: RobotModel, control: ca.SX) -> tuple[ca.SX, ca.SX]:
         within -= model.joint_force  # It is also part of f.
     drive = ca.mtimes(ca.SX(ca.sparsify(ca.DM(links.actuation_matrix))), within)
     return dae.mass_matrix[part, part], forces + drive
-
-
-def _rate(
-    model: RobotModel, contacts: Sequence[PointContact], control: ca.SX, force: ca.SX
-) -> tuple[ca.SX, ca.SX]:
-    """x' of a continuous plant, and a number that is negative where it is not valid."""
-    links = model.links
-    mass, forces = _balance(model, control)
-    jacobian = ca.vertcat(*(contact.jacobian for contact in contacts))
-    change = PositiveDefiniteFactorization(mass).solve(forces + ca.mtimes(jacobian.T, force))
-    velocity = ca.mtimes(links.velocity_map, links.v)
-    rate = ca.vertcat(velocity, change, stage_rates(model, control))
-    return rate, _within_limits(model, links.q)
 
 
 def _step(
@@ -312,23 +292,17 @@ def _within_limits(model: RobotModel, q: ca.SX) -> ca.SX:
     return reduce(ca.fmin, gaps, ca.SX(1))
 
 
-_GROWTH = 1e-7  # allowed excess of the spectral radius over 1: round-off of motions without a force
-
-_SHORTER = np.geomspace(1.0, 0.01, 300)[1:]  # of a too long step, tried for the message
-
-
 def stages_after(model: RobotModel, time_step: float, control: ca.SX) -> ca.SX:
     """s after a step of the stages as an expression of x and u, shape (k, 1).
 
-    The links get new velocities from the forces at t_n, and new positions from the new velocities.
-    The stages do the same, from E s' = drift(q, v, s) + drive u: positions of shafts follow from
-    their new velocities, and everything else from the values at t_n,
+    As the links get new positions from their new velocities, positions of shafts follow from their
+    new velocities, and everything else from the values at t_n,
 
         E (s_(n+1) - s_n) = h (drift(q_n, v_n, s_n) + drive u_n),    but p_(n+1) = p_n + h p'_(n+1).
 
     For springs, links and shafts together this is the symplectic Euler method: an undamped
     oscillation of frequency w keeps its amplitude for w h < 2, with the frequency w_h of sin(w_h h
-    / 2) = w h / 2 in place of w. An unstable step is refused: see `check_step`.
+    / 2) = w h / 2 in place of w.
     """
     dae, size = model.dae, _num_link_states(model)
     rates = stage_rates(model, control)
@@ -365,26 +339,25 @@ def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> N
     mass, force = dae.trace("linear motion", outputs, often=False)(dae.nominal_state, parameters)
     slope: FloatArray = np.asarray(np.linalg.solve(mass, force))
     positions = [*range(links.q.numel()), *_shafts(model)]
-    moved = np.zeros_like(slope)
+    moved, one = np.zeros_like(slope), np.eye(len(slope))
     moved[positions] = slope[positions]
 
     def growth(step: float) -> float:
-        one = np.eye(len(slope))
         matrix = np.linalg.solve(one - step * moved, one + step * (slope - moved))
-        return float(np.abs(np.linalg.eigvals(matrix)).max())
+        return float(np.abs(np.linalg.eigvals(matrix)).max()) - 1.0
 
-    if growth(time_step) <= 1.0 + _GROWTH:
+    round_off = 1e-7  # of motions without a force
+    if growth(time_step) <= round_off:
         return
     fastest = float(np.abs(np.linalg.eigvals(slope)).max())
-    shorter = [float(f"{part * time_step:.1e}") for part in _SHORTER]
-    fitting = next((step for step in shorter if growth(step) <= 1.0 + _GROWTH), None)
+    shorter = [float(f"{part * time_step:.1e}") for part in np.geomspace(1.0, 0.01, 300)[1:]]
+    fitting = next((step for step in shorter if growth(step) <= round_off), None)
     remedy = f", and so is one of {shorter[-1]:g} s; damp it, or take an ideal plant"
     if fitting is not None:
         remedy = f". Take {fitting:g} s or less; the law may keep its period with `sampling`"
     raise ModelError(
         f"a time_step of {time_step:g} s is too long for what drives the joints, which has motions "
-        f"of {fastest:.3g} rad/s: each step would let one grow by {growth(time_step) - 1.0:.2g}"
-        f"{remedy}"
+        f"of {fastest:.3g} rad/s: each step would let one grow by {growth(time_step):.2g}{remedy}"
     )
 
 
@@ -395,11 +368,7 @@ def _num_link_states(model: RobotModel) -> int:
 def _shafts(model: RobotModel) -> dict[int, int]:
     """The index of each shaft's position in x -> that of its velocity."""
     velocities: dict[int, int] = {}
-    for stage in model.stages:
-        if stage.shaft is not None:
-            columns = [
-                ca.DM(ca.jacobian(symbols, model.dae.state)).full().argmax(axis=1).tolist()
-                for symbols in stage.shaft
-            ]
-            velocities.update(zip(*columns, strict=True))
+    for shaft in (stage.shaft for stage in model.stages if stage.shaft is not None):
+        slopes = (ca.DM(ca.jacobian(each, model.dae.state)).full() for each in shaft)
+        velocities.update(zip(*(slope.argmax(axis=1).tolist() for slope in slopes), strict=True))
     return velocities

@@ -8,15 +8,15 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import GeometryId
 from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import ContactResults, ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.plant import ContactResults, ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import Frame
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, number, positive
 from drake_dae.blocks.block import Block, Held, Requirement
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.dae import ConstraintStructure, Signal
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.references import ExpressionReference
 from drake_dae.robots import RobotModel, Vector, contact_normals
@@ -49,16 +49,14 @@ class ContactForces(LeafSystem):
         # Independent of the time, which changes from a record to the next sample while the state
         # does not.
         self.DeclareVectorOutputPort(
-            "contact_force",
-            3 * len(pairs),
-            port_value(self._contact_force),
-            {self.all_input_ports_ticket()},
+            "contact_force", 3 * len(pairs), weakly(self._calc), {self.all_input_ports_ticket()}
         )
 
     def again(self) -> "ContactForces":
+        """Another instance."""
         return ContactForces(self._pairs)
 
-    def _contact_force(self, context: Context) -> FloatArray:
+    def _calc(self, context: Context, output: BasicVector) -> None:
         results, total = self._results.Eval(context), np.zeros(3 * len(self._pairs))
         points = map(results.point_pair_contact_info, range(results.num_point_pair_contacts()))
         patches = map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts()))
@@ -68,7 +66,7 @@ class ContactForces(LeafSystem):
         for geometry, force in forces:
             first, sign = self._owners[geometry]
             total[first : first + 3] += sign * force
-        return total
+        output.SetFromVector(total)
 
 
 def contact_block(
@@ -116,15 +114,6 @@ def contact_block(
         "controlled_output": output,
     }
     return Block("contact_signals", inputs, outputs, held=held, requirements=required)
-
-
-def contact_force_signals(model: RobotModel) -> tuple[Signal, ...]:
-    """Names and units of the contact forces F of a robot, shape (3 m,)."""
-    return tuple(
-        Signal(f"{constraint.name}.contact_f{axis}", "N")
-        for constraint in model.constraints
-        for axis in "xyz"
-    )
 
 
 @checked(ModelError)
@@ -192,15 +181,10 @@ class AppliedDisturbances(LeafSystem):
 
     __slots__ = SHARED_DICTIONARY
 
-    def __init__(
-        self,
-        plant: MultibodyPlant,
-        disturbances: Sequence[DisturbanceForce],
-        frames: Sequence[Frame],
-    ) -> None:
+    def __init__(self, disturbances: Sequence[DisturbanceForce], frames: Sequence[Frame]) -> None:
         super().__init__()
         self.set_name("disturbances")
-        self._arguments = plant, disturbances, frames
+        self._arguments = disturbances, frames
         self._forces = [each.reference.derivatives([0, 0, 0]) for each in disturbances]
         self._applied = []
         for disturbance, frame in zip(disturbances, frames, strict=True):
@@ -216,6 +200,7 @@ class AppliedDisturbances(LeafSystem):
         )
 
     def again(self) -> "AppliedDisturbances":
+        """Another instance."""
         return AppliedDisturbances(*self._arguments)
 
     def _calc(self, context: Context, output: Value) -> None:

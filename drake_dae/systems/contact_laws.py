@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots import Constraint, RobotModel, Touch
 from drake_dae.systems.contact_material import PointMaterial
@@ -56,6 +57,12 @@ def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
             )
         contacts.append((constraint, touch))
     return contacts
+
+
+def contact_force_signals(model: RobotModel) -> tuple[Signal, ...]:
+    """Names and units of the contact forces F of a robot, shape (3 m,)."""
+    names = (f"{each.name}.contact_f{axis}" for each in model.constraints for axis in "xyz")
+    return tuple(Signal(name, "N") for name in names)
 
 
 def ball_normals(model: RobotModel) -> ca.SX:
@@ -172,7 +179,7 @@ def contact_step(
     is_reduced = 3 * count > v.numel()
     delassus = None if is_reduced else ca.mtimes(jacobian, response)
     laws = [
-        _Lagged.of(contact, of_one, rows, mass, h)
+        _Lagged(contact, of_one, rows, mass, h)
         for contact, of_one, rows in zip(contacts, _each(before), _each(jacobian), strict=True)
     ]
 
@@ -250,31 +257,20 @@ def _solved(matrix: ca.SX, right: ca.SX) -> ca.SX:
     return ca.vertcat((right[0] - ca.mtimes(matrix[0, 1:], last)) / first, last)
 
 
-@dataclass(frozen=True, eq=False)
 class _Lagged:
     """The impulse of one contact as a function of its velocity, in its axes."""
 
-    contact: PointContact
-    h: float
-    elastic: ca.SX  # k x before the step
-    lagged: ca.SX  # mu gamma_0
-    softness: ca.SX  # e
-
-    @classmethod
-    def of(
-        cls, contact: PointContact, before: ca.SX, jacobian: ca.SX, mass: ca.SX, h: float
-    ) -> "_Lagged":
-        """The impulse; its velocity before the step and J are in the contact's axes."""
-        elastic = contact.stiffness * ca.fmax(contact.depth, 0)
+    def __init__(
+        self, contact: PointContact, before: ca.SX, jacobian: ca.SX, mass: ca.SX, h: float
+    ) -> None:
+        self.contact, self.h = contact, h
+        self.elastic = contact.stiffness * ca.fmax(contact.depth, 0)  # k x before the step
         damping = ca.fmax(0, 1 - contact.dissipation * before[0])
-        lagged = contact.friction * h * elastic * damping
+        self.lagged = contact.friction * h * self.elastic * damping  # mu gamma_0
         response = ca.mtimes(jacobian / ca.repmat(ca.diag(mass).T, 3, 1), jacobian.T)
-        softness = ca.fmax(contact.stiction_tolerance, SOFT * ca.norm_fro(response) / 3 * lagged)
-        return cls(contact, h, elastic, lagged, softness)
-
-    @property
-    def _viscous(self) -> ca.SX:
-        return self.h * self.contact.viscous_friction * (self.elastic > 0)
+        soft = SOFT * ca.norm_fro(response) / 3 * self.lagged
+        self.softness = ca.fmax(contact.stiction_tolerance, soft)  # e
+        self.viscous = h * contact.viscous_friction * (self.elastic > 0)
 
     def _size(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
         """v_t and |v_t|_s."""
@@ -295,7 +291,7 @@ class _Lagged:
 
     def impulse(self, velocity: ca.SX) -> ca.SX:
         """gamma in N s, shape (3, 1)."""
-        along = -self.lagged * self.share(velocity) - self._viscous * velocity[1:]
+        along = -self.lagged * self.share(velocity) - self.viscous * velocity[1:]
         return ca.vertcat(self._push(velocity)[0], along)
 
     def _push(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -310,4 +306,4 @@ class _Lagged:
         sliding, size = self._size(velocity)
         plane = ca.SX.eye(2)
         along = self.lagged / size * (plane - ca.mtimes(share, (sliding / size).T))
-        return ca.diagcat(self._push(velocity)[1], -along - self._viscous * plane)
+        return ca.diagcat(self._push(velocity)[1], -along - self.viscous * plane)

@@ -4,15 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from pydrake.geometry import (
-    AddCompliantHydroelasticProperties,
-    AddCompliantHydroelasticPropertiesForHalfSpace,
-    AddContactMaterial,
-    AddRigidHydroelasticProperties,
-    ProximityProperties,
-    Sphere,
-)
-from pydrake.multibody.plant import CoulombFriction
+from pydrake.geometry import Sphere
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
@@ -62,21 +54,9 @@ class PointMaterial:
             if value is not None and not value >= 0.0:
                 raise ModelError(f"{name} must be 0 or more, got {value:g}")
 
-    def stiffness_at(self, force: float, sphere: float | None = None) -> float:
-        """The slope of the normal force over depth, in N/m, on a plane or a sphere of a radius."""
-        return self.stiffness
-
     def stiffness_on(self, model: RobotModel, force: float) -> float:
-        """The largest of these slopes at the contacts of a robot, each with this normal force."""
-        values = model.dae.parameter_values
-        forms = [
-            solid.form
-            for constraint in model.constraints
-            if (surface := constraint.surface_at(own_values(constraint, model.dae, values)))
-            for solid in surface.solids()
-        ]
-        spheres = {form.radius() if isinstance(form, Sphere) else None for form in forms}
-        return max(self.stiffness_at(force, sphere) for sphere in spheres or {None})
+        """The largest slope, in N/m, of normal force over depth at contacts with this force."""
+        return self.stiffness
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -124,7 +104,7 @@ class ContactMaterial(PointMaterial):
             positive(name, getattr(self, name))
 
     def stiffness_at(self, force: float, sphere: float | None = None) -> float:
-        """The slope of the normal force over depth, in N/m, on a plane or a sphere of a radius.
+        """The slope of the hydroelastic force over depth, in N/m, on a plane or a sphere.
 
         A ball of radius R, pressed by d into a layer with the pressure E s / h at depth s, has a
         patch of radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h). In a
@@ -132,37 +112,20 @@ class ContactMaterial(PointMaterial):
         the place of 1 / R. Drake's mesh of a sphere has edges of about R, so that the contact is
         softer at small depths: by a third at R = 20 mm, S = 100 mm and d = 1 mm.
         """
-        if self.contact_model == "point":
-            return self.stiffness
         bend, depth = 1.0 / self.radius, self.thickness
         if sphere is not None:
             bend, depth = bend + 1.0 / sphere, sphere
         return float(2.0 * np.sqrt(np.pi * self.modulus * force / (bend * depth)))
 
-
-def ball_properties(material: ContactMaterial, friction: float) -> ProximityProperties:
-    """The properties of the ball."""
-    properties = _common_properties(material, friction)
-    if material.contact_model == "hydroelastic":
-        AddRigidHydroelasticProperties(material.radius / 8.0, properties)
-    return properties
-
-
-def surface_properties(
-    material: ContactMaterial, friction: float, is_half_space: bool
-) -> ProximityProperties:
-    """The properties of the surface."""
-    properties, modulus = _common_properties(material, friction), material.modulus
-    if material.contact_model == "hydroelastic":
-        if is_half_space:
-            AddCompliantHydroelasticPropertiesForHalfSpace(material.thickness, modulus, properties)
-        else:
-            AddCompliantHydroelasticProperties(material.radius, modulus, properties)
-    return properties
-
-
-def _common_properties(material: ContactMaterial, friction: float) -> ProximityProperties:
-    properties, frictional = ProximityProperties(), CoulombFriction(friction, friction)
-    # Two equal springs in series have half their stiffness.
-    AddContactMaterial(material.dissipation, 2.0 * material.stiffness, frictional, properties)
-    return properties
+    def stiffness_on(self, model: RobotModel, force: float) -> float:
+        if self.contact_model == "point":
+            return self.stiffness
+        values = model.dae.parameter_values
+        forms = [
+            solid.form
+            for constraint in model.constraints
+            if (surface := constraint.surface_at(own_values(constraint, model.dae, values)))
+            for solid in surface.solids()
+        ]
+        spheres = {form.radius() if isinstance(form, Sphere) else None for form in forms}
+        return max(self.stiffness_at(force, sphere) for sphere in spheres or {None})

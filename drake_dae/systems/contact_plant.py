@@ -7,19 +7,31 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddCompliantHydroelasticPropertiesForHalfSpace,
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
     CollisionFilterDeclaration,
     GeometryId,
     GeometrySet,
     HalfSpace,
     Meshcat,
+    ProximityProperties,
     Role,
     SceneGraph,
+    Shape,
     Sphere,
+    TriangleSurfaceMesh,
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
 from pydrake.multibody.tree import (
     BodyIndex,
     ModelInstanceIndex,
@@ -42,12 +54,10 @@ from drake_dae.systems.contact_forces import (
     ContactForces,
     DisturbanceForce,
     contact_block,
-    contact_force_signals,
 )
-from drake_dae.systems.contact_laws import ball_normals, touching
-from drake_dae.systems.contact_material import ContactMaterial, ball_properties, surface_properties
-from drake_dae.systems.parameterized import changed_parameters
-from drake_dae.systems.plant import Plant
+from drake_dae.systems.contact_laws import ball_normals, contact_force_signals, touching
+from drake_dae.systems.contact_material import ContactMaterial
+from drake_dae.systems.plant import Plant, changed_parameters
 
 
 def _is_relevant(record: logging.LogRecord) -> bool:
@@ -91,7 +101,6 @@ class ContactPlant(Diagram, Plant):
 
     Attributes:
         multibody: Drake's plant.
-        contact_force_signals: Names and units of `contact_force`.
 
     Raises:
         ModelError: The robot has stages of actuation, or contacts that cannot be represented.
@@ -138,11 +147,10 @@ class ContactPlant(Diagram, Plant):
         self._masses = other_masses(model, plant, self._values)
         if disturbances:
             frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
-            applied = builder.AddSystem(AppliedDisturbances(plant, disturbances, frames))
+            applied = builder.AddSystem(AppliedDisturbances(disturbances, frames))
             builder.Connect(applied.get_output_port(), plant.get_applied_spatial_force_input_port())
         block = contact_block(model, structure, self._values, material)
         signals = builder.AddSystem(TracedSystem(block, compiled=model.dae.compiled))
-        self.contact_force_signals = contact_force_signals(model)
         results, state = plant.get_contact_results_output_port(), plant.get_state_output_port()
         builder.Connect(state, signals.GetInputPort("state"))
         if "generalized_contact_force" in block.inputs:
@@ -185,7 +193,7 @@ class ContactPlant(Diagram, Plant):
                 RigidTransform(frame.GetFixedPoseInBodyFrame() @ center),
                 Sphere(material.radius),
                 f"{constraint.name}_ball",
-                ball_properties(material, friction),
+                proximity(material, friction),
             )
             touched = [
                 plant.RegisterCollisionGeometry(
@@ -193,7 +201,7 @@ class ContactPlant(Diagram, Plant):
                     solid.pose,
                     solid.form,
                     f"{constraint.name}_surface{number or ''}",
-                    surface_properties(material, friction, isinstance(solid.form, HalfSpace)),
+                    proximity(material, friction, solid.form),
                 )
                 for number, solid in enumerate(solids)
             ]
@@ -211,7 +219,7 @@ class ContactPlant(Diagram, Plant):
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
-        return {"contact_force": self.contact_force_signals}
+        return {"contact_force": contact_force_signals(self.model)}
 
     def friction(self, context: Context) -> dict[str, float]:
         if self._friction is None:
@@ -238,6 +246,25 @@ class ContactPlant(Diagram, Plant):
             else:
                 inertia = SpatialInertia(mass, center, UnitInertia.PointMass(center))
                 body.SetSpatialInertiaInBodyFrame(multibody_context, inertia)
+
+
+def proximity(
+    material: ContactMaterial, friction: float, surface: Shape | TriangleSurfaceMesh | None = None
+) -> ProximityProperties:
+    """The properties of a surface, or of the robot's ball."""
+    properties, frictional = ProximityProperties(), CoulombFriction(friction, friction)
+    # Two equal springs in series have half their stiffness.
+    AddContactMaterial(material.dissipation, 2.0 * material.stiffness, frictional, properties)
+    if material.contact_model == "point":
+        return properties
+    if surface is None:
+        AddRigidHydroelasticProperties(material.radius / 8.0, properties)
+    elif isinstance(surface, HalfSpace):
+        layer = material.thickness, material.modulus
+        AddCompliantHydroelasticPropertiesForHalfSpace(*layer, properties)
+    else:
+        AddCompliantHydroelasticProperties(material.radius, material.modulus, properties)
+    return properties
 
 
 def _names(plant: MultibodyPlant) -> tuple[list[str], ...]:
@@ -305,23 +332,19 @@ def _generalized_forces(builder: DiagramBuilder, plant: MultibodyPlant) -> Outpu
     return sorted_.get_output_port()
 
 
-OtherMass = tuple[RigidBody, float, FloatArray | None]
-"""A body, its mass in kg, and its place in m if it is a point mass."""
-
-
 def other_masses(
     model: RobotModel, plant: MultibodyPlant, values: FloatArray
-) -> tuple[OtherMass, ...]:
-    """The bodies of a plant whose mass or place is not that of the robot's file."""
+) -> list[tuple[RigidBody, float, FloatArray | None]]:
+    """Each body with another mass, or place as a point mass, than in the robot's file."""
     drawn = model.links.plant
     assert drawn is not None  # check_model.
     bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
     with_mass = (body for body in bodies if body.default_mass() > 0.0)
     known = {p.name: values[model.dae.parameter_slice(p.name)] for p in model.links.parameters}
     masses = [name for name in known if name.endswith(".mass")]
-    changed = list[OtherMass]()
+    changed = list[tuple[RigidBody, float, FloatArray | None]]()
     for body, name in zip(with_mass, masses, strict=True):
         mass, center = known[name].item(), known.get(f"{name.removesuffix('mass')}center")
         if mass != body.default_mass() or (center is not None and center.any()):
             changed.append((plant.get_body(body.index()), mass, center))
-    return tuple(changed)
+    return changed

@@ -26,8 +26,7 @@ from drake_dae.dae import (
     ZeroDynamics,
 )
 from drake_dae.errors import ModelError, NonMinimumPhaseWarning, WiringError
-from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plant import NOWHERE, Plant
+from drake_dae.systems.plant import NOWHERE, ParameterizedSystem, Plant
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System
@@ -162,18 +161,14 @@ class Controller(System):
 
 def check_law(dae: DaeSystem, law: TrackingLaw) -> None:
     """Refuses a law for a system of another size than the plant's, by a WiringError."""
-    remedy = "the law for the plant's system, TrackingLaw(plant.dae, ...), or for one like it"
-    check_same_sizes(dae, law.system, "law", remedy)
-
-
-def check_same_sizes(dae: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
-    """Refuses a part for `other`, a system of another size than the plant's."""
-    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (dae, other)]
-    if sizes[0] != sizes[1]:
-        has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
+    has, takes = (
+        f"{s.num_states} states, {s.num_controls} controls and {s.num_constraints} constraints"
+        for s in (dae, law.system)
+    )
+    if has != takes:
         raise WiringError(
-            f"the {what} is for '{other.name}' with {takes}, the plant '{dae.name}' has {has}. "
-            f"Make {remedy}"
+            f"the law is for '{law.system.name}' with {takes}, the plant '{dae.name}' has {has}. "
+            "Make the law for the plant's system, TrackingLaw(plant.dae, ...), or for one like it"
         )
 
 

@@ -15,7 +15,7 @@ from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.break_away import Observing
 from drake_dae.systems.estimator_sample import EstimatorSample
-from drake_dae.systems.parameterized import ParameterizedSystem
+from drake_dae.systems.plant import ParameterizedSystem
 
 
 @checked(ModelError)

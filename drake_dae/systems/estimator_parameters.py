@@ -155,7 +155,7 @@ class ParameterFilter:
             moved = ca.mtimes(P, row.T)
             gain = used * moved / (variance + ca.mtimes(row, moved))
             change += gain * (error - ca.mtimes(row, change))
-            P -= ca.mtimes(gain, moved.T)
+            P = _symmetric(P - ca.mtimes(gain, moved.T))
         before = ca.vertcat(theta, self._compliances)
         values = self._bounded(before + change, P)
         change = values - before
@@ -173,7 +173,7 @@ class ParameterFilter:
         grown = kept - ca.mtimes([kept, ca.DM(np.diag(1.0 / self._prior)), kept])
         keep = 1.0 - share / 2.0
         changing = np.outer(keep, keep) * P + ca.DM(np.diag(share * self._prior))
-        return changing + self._period / FADING * grown
+        return _symmetric(changing + self._period / FADING * grown)
 
     def _bounded(self, values: ca.SX, P: ca.SX) -> ca.SX:
         """theta with compliances after these projections, and with each parameter in its bounds."""
@@ -260,6 +260,11 @@ class Regressor:
         if len(self.jumps) > 1:
             jumps += [ca.mtimes(slope, change[: slope.shape[1]]) for slope in slopes[:2]]
         return _column(state, value, *slopes, *jumps)
+
+
+def _symmetric(matrix: ca.SX) -> ca.SX:
+    """Both halves by the expressions of the lower one, which are half as many."""
+    return ca.tril2symm(ca.tril(matrix))
 
 
 def _column(*parts: ca.SX) -> ca.SX:

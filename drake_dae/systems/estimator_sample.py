@@ -8,8 +8,13 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, Held, stacked, where_finite
 from drake_dae.dae import Lags, Observation, TrackingLaw
-from drake_dae.dae.disturbance import DISTURBANCE, beside, estimated_within, shares
-from drake_dae.dae.filters import ChainFilter
+from drake_dae.dae.disturbance import (
+    DISTURBANCE,
+    ChainFilter,
+    estimated_within,
+    orthogonal_part,
+    shares,
+)
 from drake_dae.errors import ModelError
 from drake_dae.systems.break_away import LITTLE, Contacts, ContactTerms, Observing
 from drake_dae.systems.estimator_parameters import MEMORY, NOISY_MEMORY, ParameterFilter, Regressor
@@ -204,7 +209,7 @@ class EstimatorSample:
     def _passed(self, contact: ContactTerms, chain: ca.SX, signal: ca.SX) -> ca.SX:
         """The lags of a signal after a sample; what a sticking contact may hide does not enter."""
         by_fast, by_slow = (
-            beside(
+            orthogonal_part(
                 contact.held,
                 contact.metric,
                 (self._before["sample"] >= 0) * (lags.after(chain, signal) - chain),
@@ -322,7 +327,7 @@ class EstimatorSample:
             stuck = self._contacts.side_by_side(contact.planes, sticks)
             metric = factors.solve if self.measures else contact.metric
             momentum = ca.mtimes(mass, moved)
-            stopped = momentum - beside(stuck, metric, momentum)
+            stopped = momentum - orthogonal_part(stuck, metric, momentum)
             moved -= factors.solve(ca.mtimes(through, stopped))
         ahead = q + period * qd + (period + self._step) / 2.0 * (moved - qd)
 
@@ -338,7 +343,7 @@ class EstimatorSample:
         new_v = moved + constrained[:, 1] + turned[:, 1]
         jump = ca.mtimes(moves, constrained[:, 2])
         jump += ca.mtimes(contact.free, ca.mtimes(moves, difference[:, 2]))
-        new_r = r + beside(contact.held, contact.metric, jump)
+        new_r = r + orthogonal_part(contact.held, contact.metric, jump)
 
         # Friction and parameters take their share of the disturbance.
         state = ca.vertcat(new_q, new_v)

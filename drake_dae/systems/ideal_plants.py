@@ -8,21 +8,28 @@ import numpy as np
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, show_state
 from drake_dae.blocks.block import Block, Projection, Requirement
-from drake_dae.blocks.failures import (
-    assembled_otherwise,
-    jammed_contact,
-    off_start,
-    singular_configuration,
-)
+from drake_dae.blocks.failures import singular_configuration
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.dae import ConstraintStructure, DaeSystem, Signal, constraint_structure_of
+from drake_dae.dae import (
+    ConstraintStructure,
+    DaeSystem,
+    Signal,
+    find_constraint_structure,
+    structure_of,
+)
 from drake_dae.dae.redundancy import manifold_of_left_out
-from drake_dae.errors import ModelError, SimulationError, SingularityError
+from drake_dae.errors import (
+    InconsistentStateError,
+    ModelError,
+    PainleveError,
+    SimulationError,
+    SingularityError,
+)
 from drake_dae.robots import ConstraintSet, RobotModel
-from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plant import Plant, port_signals
+from drake_dae.systems.plant import ParameterizedSystem, Plant, port_signals
+from drake_dae.trace.functions import SINGULAR_PIVOT
 
 
 @checked(ModelError)
@@ -73,7 +80,7 @@ class DaePlant(ParameterizedSystem, Plant):
         structure: ConstraintStructure | None = None,
         project: bool = True,
     ) -> None:
-        structure = constraint_structure_of(type(self).__name__, system, structure)
+        structure = structure_of(system, structure, find_constraint_structure)
         self._start(structure, dae_block(structure, project))
 
     def _start(self, structure: ConstraintStructure, block: Block) -> None:
@@ -92,10 +99,25 @@ class DaePlant(ParameterizedSystem, Plant):
         parameters = values.get("parameters", np.zeros(0)).copy()
         if "input exogenous" in values:
             parameters[self.exogenous_places] = values["input exogenous"]
-        if not self.dae.frictional_contacts:
-            names = self.structure.dependent_constraints(error.state, parameters)
-            return singular_configuration(self.dae.name, error.time, error.state, names)
-        return jammed_contact(self.structure, error, parameters) or error
+        dae, state = self.dae, error.state
+        contacts = dae.frictional_contacts
+        if not contacts:
+            names = self.structure.dependent_constraints(state, parameters)
+            return singular_configuration(dae.name, error.time, state, names)
+        reserve = contacts.reserve(self.structure.elimination.constraint_matrix)
+        (value,) = dae.trace("reserve", {"reserve": reserve}, often=False)(state, parameters)
+        if not value.item() < SINGULAR_PIVOT:
+            return error
+        places = ", ".join(f"'{dae.constraint_input_signals[i].name}'" for i in contacts.rows)
+        return PainleveError(
+            f"{dae.name}: Painleve paradox at the contact of {places} at t = {error.time:.6g} s, "
+            f"state {show_state(state)}: a principal minor of A(x) has come to "
+            f"{value.item():.2g} of what it is without friction, so that no force fits, or "
+            "several. Lower the friction, slide the other way, or hold the robot less steeply to "
+            "the surface",
+            error.time,
+            state,
+        )
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
@@ -103,12 +125,30 @@ class DaePlant(ParameterizedSystem, Plant):
 
     def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
         """Refuses a start off N*, or that violates redundant constraints that were left out."""
-        name, manifold, left_out = self.dae.name, self.structure.manifold, self._left_out
+        manifold, left_out = self.structure.manifold, self._left_out
         if not manifold.is_consistent(state, parameters):
-            raise off_start(name, manifold, manifold.residual(state, parameters))
+            residual = manifold.residual(state, parameters)
+            table = ", ".join(
+                f"{signal.name} = {value:.3g} {signal.unit}"
+                for signal, value in zip(manifold.residual_signals, residual, strict=True)
+                if not abs(value) <= 1e-3 * np.max(np.abs(residual))
+            )
+            raise InconsistentStateError(
+                f"{self.dae.name}: the start state is not on the constraint: {table}. Call "
+                "set_consistent_state(context, guess) to start from the nearest consistent state",
+                residual,
+            )
         if left_out is not None and not left_out.is_consistent(state, parameters):
             residual = left_out.residual(state, parameters)
-            raise assembled_otherwise(name, left_out, state, residual)
+            worst = int(np.argmax(np.abs(residual)))
+            signal = left_out.residual_signals[worst]
+            raise InconsistentStateError(
+                f"{self.dae.name}: the constraints that stay hold at state {show_state(state)}, "
+                f"but not the redundant '{signal.name}', which was left out: {residual[worst]:.3g} "
+                f"{signal.unit}. The robot is assembled in another way there, or a parameter moves "
+                "one of these constraints and not the others; start nearer to where all hold",
+                residual,
+            )
 
 
 def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
@@ -192,7 +232,7 @@ class RobotPlant(DaePlant):
         structure: ConstraintStructure | None = None,
         project: bool = True,
     ) -> None:
-        structure = constraint_structure_of(type(self).__name__, model.dae, structure)
+        structure = structure_of(model.dae, structure, find_constraint_structure)
         self.model: RobotModel = model
         self._start(structure, robot_block(model, structure, project))
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from math import factorial
 
 import casadi as ca
@@ -63,8 +63,7 @@ class ReferenceGenerator(TracedSystem):
         given = {"time": np.array([time]), "parameters": self._base.default("parameters")}
         (values,) = self._function.evaluate(*(given[source] for source in self._function.sources))
         if not self._function.is_valid:
-            failure, moment = self._function.failure(), np.zeros(0)
-            raise simulation_error(failure, time, moment, {})
+            raise simulation_error(self._function.failure(), time, np.zeros(0), {})
         return values.copy()
 
     @cached_property
@@ -78,18 +77,17 @@ class ReferenceGenerator(TracedSystem):
             ReferenceSignalError: There is no such parameter, or the value does not fit.
         """
         self.check_context(context)
-        known, first = self.reference_parameters, 0
+        known = self.reference_parameters
         if name not in known:
             raise ReferenceSignalError(unknown_name("parameter of references", name, known))
-        size, given = known[name].size, numbers(f"parameter '{name}'", value, ReferenceSignalError)
-        if given.shape not in ((), (size,)) or not all_finite(given):
+        owners = [each for each, default in known.items() for _ in range(default.size)]
+        given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
+        if given.shape not in ((), known[name].shape) or not all_finite(given):
             raise ReferenceSignalError(
-                f"parameter '{name}' takes {size} finite numbers, got {value!r}"
+                f"parameter '{name}' takes {known[name].size} finite numbers, got {value!r}"
             )
-        for before in takewhile(lambda each: each != name, known):
-            first += known[before].size
         values = context.get_numeric_parameter(0).CopyToVector()
-        values[first : first + size] = given
+        values[np.array(owners) == name] = given
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
 
@@ -185,8 +183,7 @@ class TrajectoryReference(Reference):
         pieces = self._pieces
         table = [pieces.expression(time)]
         for order in range(max(degrees)):
-            _check_breaks(pieces, order, degrees)
-            pieces = _derivative(pieces)
+            pieces = _derivative(pieces, order, degrees)
             table.append(pieces.expression(time))
         rows = [table[k][i] for i, degree in enumerate(degrees) for k in range(degree + 1)]
         return ca.substitute(self.range.of(ca.vertcat(*rows)), TIME, time)
@@ -222,8 +219,10 @@ class TrajectoryReference(Reference):
         return PiecewisePolynomials(breaks, factors)
 
 
-def _check_breaks(pieces: PiecewisePolynomials, order: int, degrees: Sequence[int]) -> None:
-    """Refuses a jump of a derivative below the highest one."""
+def _derivative(
+    pieces: PiecewisePolynomials, order: int, degrees: Sequence[int]
+) -> PiecewisePolynomials:
+    """The derivative of the one of this order, which must not jump below the highest one."""
     before = pieces.factors[:-1].sum(axis=2)
     jumps = pieces.factors[1:, :, 0] - before
     needed = order < np.array(degrees)
@@ -233,9 +232,6 @@ def _check_breaks(pieces: PiecewisePolynomials, order: int, degrees: Sequence[in
             f"{jumps[i, row]:.3g} at t = {pieces.breaks[i + 1]:g} s, but the law needs a "
             f"reference with {degrees[row]} derivatives; use a smoother trajectory"
         )
-
-
-def _derivative(pieces: PiecewisePolynomials) -> PiecewisePolynomials:
     powers = np.arange(pieces.factors.shape[2])
     factors = (pieces.factors * powers)[:, :, 1:] / np.diff(pieces.breaks)[:, None, None]
     constant = np.zeros((*factors.shape[:2], 1))
@@ -261,9 +257,8 @@ class CommandedReferences(ReferenceGenerator):
 
     and y_mu is added to the reference. Its derivatives up to mu are sums of y_0, ..., y_mu. A lag
     is a mean with positive weights, so that y_mu does not overshoot, |y_mu'| <= V, and
-    |y_mu^(k)| <= (2 w)^(k-1) V. The state are the lags. `depth` is their least number, for another
-    block with the same commands and more derivatives; `signals` are names and units of the outputs,
-    and so of the commands.
+    |y_mu^(k)| <= (2 w)^(k-1) V. `depth` is the least number of lags, for another block with the
+    same commands and more derivatives; `signals` are names and units of outputs and commands.
     """
 
     __slots__ = TracedSystem.__slots__
@@ -285,10 +280,6 @@ class CommandedReferences(ReferenceGenerator):
             )
         self._base = base = reference_block(self.references, self.degrees, {})
         self.commands = tuple(signals)
-        if len(self.commands) != len(self.degrees):
-            raise ReferenceSignalError(
-                f"{len(self.degrees)} degrees have {len(self.commands)} signals"
-            )
         command = ca.SX.sym("c", len(self.commands))
         states, rates, rows = list[ca.SX](), list[ca.SX](), list[ca.SX]()
         for i, (degree, signal) in enumerate(zip(degrees, self.commands, strict=True)):

@@ -95,21 +95,27 @@ class StateSensor(TracedSystem):
 
     The measurement of t_k = k period is held until the next sample; at t_k itself the output is a
     function of the state at that instant, which a law sampled then uses. Entries of x after q and v
-    are not changed.
+    are not changed. The output has the name of the input of Drake's controllers that it goes to,
+    `estimated_state`, although nothing is estimated here: a StateEstimator has the same port.
     """
 
     __slots__ = SHARED_DICTIONARY
     measures = True  # It is part of the machine, not of a controller that is exported alone.
 
     def __init__(self, size: int, num_positions: int, encoders: Encoders, period: float) -> None:
-        check_whole_number("num_positions", num_positions, 1)
         check_whole_number("size", size, 2 * num_positions)
         self.encoders, self.sample_period = encoders, positive("period", period)
         count = num_positions
-        resolution, bias, position_noise, velocity_noise = (
-            _each(name, getattr(encoders, name), count)
-            for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
-        )
+        numbers_of = list[FloatArray]()
+        for name in ("resolution", "position_bias", "position_noise", "velocity_noise"):
+            values = np.asarray(getattr(encoders, name), dtype=float)
+            if values.shape not in ((), (count,)):
+                raise ModelError(
+                    f"the {name} of encoders has {values.size} entries, the robot has {count} "
+                    "positions"
+                )
+            numbers_of.append(np.broadcast_to(values, (count,)))
+        resolution, bias, position_noise, velocity_noise = numbers_of
         state, held = ca.SX.sym("state", size), ca.SX.sym("held", 1 + 2 * count)
         q, v = state[:count] + bias, state[count : 2 * count]
         inputs = {"state": state}
@@ -144,16 +150,6 @@ def _rounded(number: ca.SX) -> ca.SX:
     is_tie = ca.eq(up, number + 0.5)
     is_odd = ca.eq(2.0 * ca.floor(up / 2.0) + 1.0, up)
     return up - ca.logic_and(is_tie, is_odd)
-
-
-def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
-    """One number for each position."""
-    values = np.asarray(given, dtype=float)
-    if values.shape not in ((), (count,)):
-        raise ModelError(
-            f"the {name} of encoders has {values.size} entries, the robot has {count} positions"
-        )
-    return np.broadcast_to(values, (count,))
 
 
 @checked(ModelError)
@@ -248,7 +244,6 @@ class ForceSensor(TracedSystem):
         """
         self.check_context(context)
         size = self.block.inputs["force"].numel()
-        check_whole_number("the size of a ForceSensor", size, 1)
         errors = _errors(size, bias, noise_deviation, drift)
         if errors[size : 2 * size].any() and "noise" not in self.block.inputs:
             raise ModelError("a ForceSensor that was made without noise has no port for it")
@@ -263,17 +258,6 @@ class ForceSensor(TracedSystem):
         if self.sample_period:
             bias, _, drift = np.split(context.get_numeric_parameter(0).value(), 3)
             context.SetDiscreteState(0, value + bias + drift * context.get_time())
-
-    def largest_stable_gain(self) -> float:
-        """The largest gain Gbar of (59) for which a rigid robot's force error decays.
-
-        With the lag alone it is infinite: the error decays at (1 + Gbar) / time_constant. A sampled
-        sensor multiplies it by a - (1 - a) Gbar a step, a = exp(-sample_period / time_constant).
-        """
-        if not self.sample_period:
-            return np.inf
-        a = np.exp(-self.sample_period / self.time_constant) if self.time_constant else 0.0
-        return float((1.0 + a) / (1.0 - a))
 
 
 def _errors(size: int, *errors: ArrayLike) -> FloatArray:

@@ -23,17 +23,9 @@ from drake_dae.systems.automaton import (
     SUCCESS,
     Automaton,
 )
-from drake_dae.systems.controller import (
-    Compared,
-    Controller,
-    Derived,
-    PhaseChange,
-    check_same_sizes,
-)
-from drake_dae.systems.opening_contact import opening_contact
-from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plant import Plant
-from drake_dae.systems.task import Task
+from drake_dae.systems.controller import Compared, Controller, Derived, PhaseChange, check_law
+from drake_dae.systems.plant import ParameterizedSystem, Plant
+from drake_dae.systems.task import Task, opening_contact
 
 
 @checked(ModelError)
@@ -56,27 +48,20 @@ class TaskController(ParameterizedSystem, Controller):
 
     Output ports:
         control: u, shape (p,).
-        phase: The index of the phase in the task, shape (1,); after the last one their number.
+        phase: The index of the phase in the task; after the last one their number.
         ending: 0 while the task goes on; 1 when it is done; 2 when the robot rests by "hold" or
-            "leave" after a success, 3 when the task is given up, shape (1,).
+            "leave" after a success, 3 when the task is given up.
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
             of k points. In contact the distances are zero, otherwise the forces.
         contact_reference: R of the law in contact while it is active, otherwise 0, as before the
             first sample; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
-        change: The last change of phase, shape (10,); `changes` reads it from a record.
+        change: The last change of phase, `CHANGE`.
         integral, free_integral: The integrals of each law, if it has any. They are not updated
             while the other law is active, no force is measured, or just after a touch.
 
-    Args:
-        task: The phases.
-        law: The law in contact; one of its outputs is the force, such as "wall.force". Several
-            points open and close together: then as many outputs are forces, one of them their sum.
-        free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
-        sample_period: The period of guards and integrals of errors, in s.
-
-    Raises:
-        ModelError: The laws do not belong together, or a phase has a reference that does not fit.
+    `law` acts in contact, with the force among its outputs; of several points as many outputs are
+    forces, one of them their sum. `free_law` is for `open_contact(law.system, "wall.force")`.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -103,13 +88,7 @@ class TaskController(ParameterizedSystem, Controller):
     def rest_state(
         self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """The state of the free robot at rest near a guess.
-
-        `outputs` are those of the free law, shape (p,), with the distance in place of the force.
-
-        Raises:
-            InconsistentStateError: None is found near the guess.
-        """
+        """The state of the free robot at rest near a guess, with these outputs of the free law."""
         law = self.free_law
         goal = np.zeros(law.layout.reference_size)
         goal[law.layout.lowest] = vector(f"{self.get_name()}: outputs", outputs, len(law.degrees))
@@ -133,7 +112,7 @@ class TaskController(ParameterizedSystem, Controller):
         return np.array(self._values(context)[: self.law.all_parameters().size])
 
     def check_plant(self, plant: Plant) -> None:
-        check_same_sizes(plant.dae, self.law.system, "task", "the laws for the plant's robot")
+        check_law(plant.dae, self.law)
         if plant.is_ideal:
             raise WiringError(
                 "a task needs a contact that opens, and constraints of this plant hold exactly: "

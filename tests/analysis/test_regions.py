@@ -7,7 +7,7 @@ from problems import PROBLEMS
 
 from drake_dae.analysis import analyze
 from drake_dae.dae import DaeSystem, Manifold
-from drake_dae.dae.samples import Region
+from drake_dae.dae.samples import Samples
 
 
 def test_given_states():
@@ -41,7 +41,8 @@ def test_downhill_along_the_manifold():
 
     start = np.array([-0.8, 0.6])
     for high, end in ((2.0, goal), (0.28, np.array([0.28, 0.96]))):
-        region = Region(np.array([-2.0, -2.0]), np.array([high, 2.0]))
-        found = region.descend(circle(), distance, start)
+        samples = Samples(circle(), start[None])
+        samples.states = np.array([[-2.0, -2.0], [high, 2.0]])  # Which span the box.
+        found = samples.descend(distance, start)
         assert np.linalg.norm(found) == pytest.approx(1.0, abs=1e-12)
         np.testing.assert_allclose(found, end, atol=1e-5)

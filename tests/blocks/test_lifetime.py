@@ -13,7 +13,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from runs import scenario, some
 
 import drake_dae as dd
-from drake_dae.running import compiled_run
+from drake_dae.running import merged_run
 from drake_dae.systems.references import ReferenceGenerator
 
 
@@ -57,7 +57,7 @@ def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], Lea
 
 @pytest.mark.slow
 def test_a_loop_on_drakes_contact_is_freed_after_it_ran_with_one_call_a_sample(monkeypatch):
-    monkeypatch.setattr(compiled_run, "WORTH", 1)  # Short runs, too.
+    monkeypatch.setattr(merged_run, "WORTH", 1)  # Short runs, too.
     chosen = scenario("wall_point_contact", "compiled=false")
     made, context = dd.build_scenario(chosen)
     dd.simulate(made.diagram, context, 0.01, chosen.integrator)

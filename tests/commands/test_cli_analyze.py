@@ -23,14 +23,6 @@ def analyze(capsys, *arguments):
     return code, captured.out
 
 
-def course(courses, name):
-    (found,) = [c for c in courses if c.signal.name == name]
-    return found
-
-
-# Against another route.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(["two_link_wall", "seven_joint_wall", "two_link_flexible"]))
 def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
@@ -43,25 +35,19 @@ def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
     record = run(loop, context, case.duration, case.integrator)
     # What integration to 1e-8, or fixed steps of 5 ms, leave of the error.
     assert np.abs(record["tracking_error"]).max() < 1e-6
-    groups = (
-        ("control", told.of(LimitKind.CONTROL)),
-        ("constraint_force", told.of(LimitKind.FORCE)),
-    )
-    for key, courses in groups:
-        recorded = record.signals[key]
-        scale = np.abs(recorded.values).max()
+    keys = {"control": LimitKind.CONTROL, "constraint_force": LimitKind.FORCE}
+    for key, kind in keys.items():
+        recorded, courses = record.signals[key], {c.signal.name: c for c in told.of(kind)}
+        off = 1e-3 * np.abs(recorded.values).max()  # A peak between the steps is missed.
         for signal, values in zip(recorded.signals, recorded.values.T, strict=True):
-            found = course(courses, signal.name)
-            # A peak between the steps of the record is missed.
-            for value, time in (
-                (found.least, found.least_time),
-                (found.largest, found.largest_time),
-            ):
-                assert np.interp(time, record.time, values) == pytest.approx(
-                    value, abs=1e-3 * scale
-                )
-            assert found.least <= values.min() + 1e-3 * scale
-            assert found.largest >= values.max() - 1e-3 * scale
+            found = courses[signal.name]
+            at_least, at_largest = np.interp(
+                [found.least_time, found.largest_time], record.time, values
+            )
+            assert at_least == pytest.approx(found.least, abs=off)
+            assert at_largest == pytest.approx(found.largest, abs=off)
+            assert found.least <= values.min() + off
+            assert found.largest >= values.max() - off
     states = record.signals["state"]
     for found in told.of(LimitKind.POSITION, LimitKind.SPEED):
         index = [signal.name for signal in states.signals].index(found.signal.name)
@@ -128,7 +114,7 @@ def test_a_contact_that_would_have_to_pull(capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("periods", [10, 200, 1000])
+@pytest.mark.parametrize("periods", [10, 1000])
 def test_times_follow_a_reference_that_even_times_would_not_see(periods):
     """1001 even times over 1000 periods see sin(2 pi t) as 0, and half as many as a beat."""
     wanted = lambda t: np.array([4.0 + 5.0 * np.sin(2 * np.pi * t), 0.3])  # noqa: E731

@@ -7,10 +7,11 @@ import pytest
 
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
-from drake_dae.running.export import loop as exported
+from drake_dae.running import export as exported
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.studies.study import FILES
 
 BARE = ("--set=write.plots=false", "--set=write.animation=false")
 QUICK = ("--set=duration=0.2", *BARE)
@@ -22,32 +23,28 @@ def told(arguments, capsys):
     return code, json.loads(capsys.readouterr().out)
 
 
-MISSED = {
-    # Steps of 0.05 s are too long for Euler's method, and nothing else is wrong.
-    "without a reason": [
-        "--set=integrator={integration_scheme: explicit_euler, use_error_control: false, "
-        "max_step_size: 0.05}",
-        "--set=duration=2",
-    ],
-    # The force would pull: -5 N.
-    "a contact that pulls": ["--set=references.wall.force=-5", "--set=duration=0.2"],
-    # The mass is another one, to the end.
-    "a plant that the law does not know": [
-        "--set=plant.parameters={link1.mass: 20}",
-        "--set=duration=1",
-    ],
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("reason", MISSED)
-def test_a_run_that_missed_its_task_is_reported_by_code_and_json(reason, tmp_path, capsys):
-    run = ["simulate", "two_link_wall", "--json", *BARE, *MISSED[reason]]
+@pytest.mark.parametrize(
+    ("changes", "is_off"),
+    [
+        # Steps of 0.05 s are too long for Euler's method, and nothing else is wrong.
+        (
+            [
+                "--set=integrator={integration_scheme: explicit_euler, use_error_control: false, "
+                "max_step_size: 0.05}",
+                "--set=duration=2",
+            ],
+            True,
+        ),
+        # The force would pull: -5 N.
+        (["--set=references.wall.force=-5", "--set=duration=0.2"], False),
+    ],
+)
+def test_a_run_that_missed_its_task_is_reported_by_code_and_json(changes, is_off, tmp_path, capsys):
+    run = ["simulate", "two_link_wall", "--json", *BARE, *changes]
     code, found = told([*run, "--check", f"--out={tmp_path / 'one'}"], capsys)
-    assert (code, found["missed"]) == (2, True)
-    assert found["outcome"] == "bad"
-    kinds = {one["kind"] for one in found["findings"]}
-    assert ("prediction" in kinds) is (reason != "a contact that pulls")
+    assert (code, found["missed"], found["outcome"]) == (2, True, "bad")
+    assert ("prediction" in {one["kind"] for one in found["findings"]}) is is_off
     # Whoever does not ask gets 0 for a run that came to its end.
     code, again = told([*run, f"--out={tmp_path / 'two'}"], capsys)
     assert (code, again["missed"]) == (0, True)
@@ -65,30 +62,6 @@ def test_a_good_run_is_reported_with_figures_and_files(tmp_path, capsys):
     outputs = {one["name"]: one for one in found["outputs"]}
     assert [*outputs] == [s.name for s in record.signals["tracking_error"].signals]
     assert 0.0 <= max(one["off_prediction"] for one in outputs.values()) < 1e-6
-
-
-# What it takes.
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["simulate", "--out", ""], "--out"),
-        (["sweep", "--vary", "a=1", "--out="], "--out"),
-        (["play", ""], "RUN"),
-        (["sweep", "--vary", "a=1", "--random=x"], "'x'"),
-    ],
-)
-def test_words_that_mean_nothing_are_wrong_usage(arguments, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 2
-    assert words in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-# Where it starts.
 
 
 @pytest.mark.slow
@@ -114,3 +87,60 @@ def test_all_commands_start_at_the_same_state(tmp_path, monkeypatch):
     own = loop.plant.GetMyContextFromRoot(context)
     state = own.get_continuous_state_vector().CopyToVector()
     np.testing.assert_allclose(state, first, atol=1e-9)
+
+
+# Of a study.
+
+SHORT = ["--set", "duration=0.2", "--set", "compiled=false"]
+VARY = ["--vary", "start.errors.tool.z=0..0.05:3"]
+
+
+@pytest.mark.slow
+def test_it_leaves_its_files_and_tells_programs_and_people(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "runs" / "two_link_wall-sweep"
+    words = ["sweep", "two_link_wall", "--workers=1", "--vary=start.errors.tool.z=[0, 0.01, 9]"]
+    assert main([*words, *SHORT, "--json", "--check"]) == 2
+    found = json.loads(capsys.readouterr().out)
+    assert found["outcomes"] == {"finished": 2, "no start": 1}
+    assert [run["run"] for run in found["not_finished"]] == [2]
+    extent = found["figures"]["largest error of tool.z [m]"]
+    assert 0.0 <= extent["least"] <= extent["median"] <= extent["largest"] < 0.1
+    assert found["files"] == ["runs.db", *FILES]
+    assert {path.name for path in folder.iterdir()} == {*found["files"]}
+    # It has all runs already.
+    assert main([*words, *SHORT]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("3 runs: 2 finished")
+    assert printed.out.endswith(f"/: {', '.join(['runs.db', *FILES])}\n")
+    assert main([*words, *SHORT[2:], "--set", "duration=0.3"]) == 1
+    said = capsys.readouterr().err
+    assert "duration" in said
+    assert "runs/two_link_wall-sweep/runs.db" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--vary", "start.errors.tool=0.1"], "start.errors: no output 'tool'"),
+        (["--vary", "start.error=0.1"], "start: has no key 'error'; did you mean 'errors'"),
+        (["--vary", "duration=1..2"], "duration: 1..2 needs the number of its values"),
+        (["--vary", "duration=1..2", "--random", "0"], "count must be a whole number from 1"),
+        (["--vary", "duration=1", "--workers", "0"], "workers must be a whole number from 1"),
+        (["--vary", "plant.parameters.a=1"], "plant.parameters: two_link_arm: no parameter 'a'"),
+    ],
+)
+def test_errors_are_reported_before_anything_runs(options, line, tmp_path, capsys):
+    folder = tmp_path / "out"
+    assert main(["sweep", "two_link_wall", *options, *SHORT, "--out", str(folder)]) == 1
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("error: ")
+    assert line in said
+    assert not folder.exists()
+
+
+def test_the_files_of_others_are_left_alone(tmp_path, capsys):
+    (tmp_path / "runs.csv").write_text("mine")
+    assert main(["sweep", "two_link_wall", *VARY, *SHORT, "--out", str(tmp_path)]) == 1
+    assert "runs.csv" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["runs.csv"]

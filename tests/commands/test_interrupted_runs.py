@@ -1,5 +1,6 @@
-"""Runs that a signal ends: what they leave is readable and is what was simulated."""
+"""Runs that a signal ends leave what was simulated; files appear when they are complete."""
 
+import errno
 import signal
 import subprocess
 import sys
@@ -11,7 +12,8 @@ from command_line import QUICK, command
 from runs import scenario, some
 
 from drake_dae import Record, simulate
-from drake_dae.running.interruption import ENDING_SIGNALS
+from drake_dae.commands.writing import complete
+from drake_dae.running.interruption import ENDING_SIGNALS, end_at_once, ending_signals
 from drake_dae.scenario.build import build_scenario
 
 
@@ -37,7 +39,7 @@ def test_each_signal_in_the_middle_of_a_run(tmp_path):
     simulate(loop.diagram, context, 10.0, chosen.integrator)
     undisturbed = loop.record(context)
     for sent, process in runs.items():
-        printed, _ = process.communicate(timeout=60)
+        printed, _ = process.communicate(timeout=600)
         assert process.returncode == 128 + sent
         assert "tracking error" in printed
         left = sorted(path.name for path in folders[sent].iterdir())
@@ -77,5 +79,38 @@ sys.exit(main(["plot", "nowhere"]))
 def test_a_signal_waits_while_drake_is_loaded(sent):
     """Its modules make an ImportError of a KeyboardInterrupt, and the command ended with that."""
     words = [sys.executable, "-c", LOADING.format(sent=sent)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stderr) == (128 + signal.Signals[sent], "interrupted\n")
+
+
+def test_files_appear_when_they_are_complete(tmp_path):
+    with complete(tmp_path / "new") as place:
+        for name in ("one", "two"):
+            (place / name).write_text(name)
+            assert not (tmp_path / "new" / name).exists()
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["one", "two"]
+
+
+@pytest.mark.parametrize("path", [None, "in its place", "elsewhere"])
+def test_an_error_names_the_file(path, tmp_path):
+    def fail(place):
+        names = {None: (), "in its place": (str(place / "one"),), "elsewhere": ("/mesh.obj",)}
+        raise OSError(errno.ENOSPC, "No space left on device", *names[path])
+
+    with pytest.raises(OSError, match="No space left") as caught, complete(tmp_path, "one") as at:
+        fail(at)
+    assert caught.value.filename == ("/mesh.obj" if path == "elsewhere" else str(tmp_path / "one"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_leaves_nothing_unfinished(sent, tmp_path):
+    def write():
+        with ending_signals(end_at_once), complete(tmp_path, "one") as place:
+            (place / "one").write_text("1")
+            signal.raise_signal(sent)
+
+    with pytest.raises(KeyboardInterrupt) as ended:
+        write()
+    assert ended.value.args == (sent,)
+    assert not list(tmp_path.iterdir())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from drake_dae.dae.filters import ChainFilter, Lags, transition
+from drake_dae.dae.disturbance import ChainFilter, Lags, transition
 
 T = 1e-4
 

@@ -9,7 +9,7 @@ from runs import some
 from scipy.integrate import solve_ivp
 
 from drake_dae.dae import SensorNoise
-from drake_dae.dae.filters import ChainFilter, transition
+from drake_dae.dae.disturbance import ChainFilter, transition
 from drake_dae.dae.one_direction import Direction, DirectionGains, sampled_loop
 
 T = 1e-3

@@ -1,9 +1,10 @@
-"""Zero dynamics: eigenvalues against pencils, and verdicts on stability."""
+"""Zero dynamics: eigenvalues against pencils and by hand, and verdicts on stability."""
 
 import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
+from problems import PROBLEMS
 from problems.zero_systems import (
     GRAVITY,
     Array,
@@ -14,7 +15,7 @@ from problems.zero_systems import (
 )
 from runs import some
 
-from drake_dae.dae import DaeSystem, Verdict
+from drake_dae.dae import DaeSystem, Verdict, ZeroDynamics
 
 
 def finite_zeros(system: DaeSystem) -> Array:
@@ -101,3 +102,14 @@ def test_a_center_is_undecided_and_the_least_damping_is_not(damping):
     )
     expected = {0.0: Verdict.UNDECIDED, -1e-6: Verdict.UNSTABLE}
     assert stability.verdict is expected.get(damping, Verdict.STABLE)
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict"), [("linear", Verdict.STABLE), ("aircraft", Verdict.UNSTABLE)]
+)
+def test_the_verdict_is_that_of_the_literature(name, verdict):
+    stability = ZeroDynamics(PROBLEMS[name]().system).stability()
+    assert stability.verdict is verdict
+    if name == "aircraft":  # e roll'' = sin roll with e = 0.5.
+        expected = [-np.sqrt(2.0), np.sqrt(2.0)]
+        np.testing.assert_allclose(np.sort_complex(stability.eigenvalues), expected, rtol=1e-7)

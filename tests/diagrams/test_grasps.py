@@ -1,11 +1,9 @@
 """Scenarios whose outputs are internal forces, against MultibodyPlant and pencil and paper.
 
-The truth is [[M, -J^T], [J, 0]] (v', lambda) = (tau - H, -Jdot v) with M, H and J of Drake, and the
-errors (d/dt + w)^mu e = 0 of poles -w from a start at rest, solved by hand.
+The truth is [[M, -J^T], [J, 0]] (v', lambda) = (tau - H, -Jdot v) with M, H and J of Drake.
 """
 
 from functools import cache
-from math import comb, factorial
 
 import numpy as np
 import pytest
@@ -50,30 +48,6 @@ def motion(mass, force, jacobian, bias, torque):
     m = len(bias)
     matrix = np.block([[mass, -jacobian.T], [jacobian, np.zeros((m, m))]])
     return np.split(np.linalg.solve(matrix, [*(torque - force), *-bias]), [len(mass)])
-
-
-def sinusoid(reference, time, order=0):
-    """The derivative of a shipped reference, by hand."""
-    amplitude, frequency = np.array(reference.amplitudes), np.array(reference.frequencies)
-    phases = np.zeros_like(amplitude) if reference.phases is None else np.array(reference.phases)
-    angle = np.outer(time, frequency) + phases + order * np.pi / 2
-    return np.sin(angle) @ (amplitude * frequency**order) + (reference.offset if not order else 0.0)
-
-
-def decay(time, start, rate):
-    """e(t) of (d/dt + rate)^mu e = 0 with e, e', ..., e^(mu-1) at the start."""
-    total = np.zeros_like(time)
-    for k in range(len(start)):  # (e exp(rate t))^(k) at the start
-        grown = sum(comb(k, j) * rate ** (k - j) * start[j] for j in range(k + 1))
-        total += grown * time**k / factorial(k)
-    return total * np.exp(-rate * time)
-
-
-def at_rest(record, reference, index, degree, rate=6.0):
-    """The error of an output from a start where all its derivatives are zero."""
-    first = record["controlled_output"][0, index] - sinusoid(reference, [0.0])[0]
-    derivatives = [-sinusoid(reference, [0.0], order)[0] for order in range(1, degree)]
-    return decay(record.time, [first, *derivatives], rate)
 
 
 # Three fingers: 9 joints, 6 positions of the puck, 9 forces of which 3 are internal.
@@ -162,17 +136,6 @@ def test_forces_of_two_arms_on_a_free_box_are_those_of_drake():
         internal = (left - right) / 2.0
         assert_allclose(record["controlled_output"][step, 8:], internal, atol=1e-9)
         assert left[0] > 10.0 > -10.0 > right[0]  # Both press.
-
-
-@pytest.mark.slow
-def test_two_arms_carry_a_free_box_with_the_error_by_hand():
-    references = list(scenario("two_arms_free_box", *FINE).references.values())
-    _, _, record = run("two_arms_free_box", *FINE)
-    for index in (0, 1, 2):
-        error = record["tracking_error"][:, index]
-        wanted = at_rest(record, references[index], index, 2, rate=4.0)
-        assert_allclose(error, wanted, atol=1e-9)
-    assert_allclose(record["tracking_error"][:, 8:], 0.0, atol=1e-9)  # Met at once.
 
 
 # What does not fit.

@@ -5,10 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 from runs import scenario
 
-from drake_dae import FlexibleJoints, RobotModel, TrackingLaw, ZeroDynamics, build_scenario, poles
+from drake_dae import build_scenario
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import Verdict
-from drake_dae.scenario.model import scenario_model
 
 NAME = "planar_4rrr"
 PROXIMAL, DISTAL = (0.25, 0.8, 0.015), (0.3, 0.5, 0.012)  # length m, mass kg, radius m
@@ -130,30 +128,3 @@ def test_the_law_and_the_pins_are_those_of_newton_and_euler():
         assert_allclose(plant.GetOutputPort("constraint_force").Eval(context), forces, atol=1e-11)
         accelerations = plant.EvalTimeDerivatives(context).CopyToVector()[11:14]
         assert_allclose(accelerations, second, atol=1e-11)
-
-
-@pytest.mark.slow
-def test_springs_before_its_legs_leave_one_of_them_to_swing():
-    """Four motors on springs, three outputs of degree 4: the fourth combination of deflections d is
-    zero dynamics, m d'' + k d = 0, which nothing damps: eigenvalues +-i sqrt(k / m)."""
-    stiffness, inertia = 400.0, 0.02
-    rigid = scenario_model(scenario(NAME))
-    springs = [FlexibleJoints(stiffness=stiffness, inertia=inertia)]
-    model = RobotModel(
-        rigid.links,
-        rigid.constraints,
-        rigid.outputs,
-        rigid.dae.nominal_state[:11],
-        actuation=springs,
-        forces=[],
-        control_weights=1.0,
-    )
-    law = TrackingLaw(model.dae, poles(-5.0))
-    assert law.structure.output_degrees == (4, 4, 4)
-    dynamics = ZeroDynamics(model.dae, structure=law.structure)
-    assert dynamics.dimension == 2
-    found = dynamics.stability()
-    assert found.verdict is Verdict.UNDECIDED
-    swing = np.sqrt(stiffness / inertia)
-    assert_allclose(np.sort(found.eigenvalues.imag), [-swing, swing], rtol=1e-6)
-    assert_allclose(found.eigenvalues.real, 0.0, atol=1e-6 * swing)

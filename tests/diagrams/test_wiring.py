@@ -5,7 +5,7 @@ import pytest
 from arms import arm, touching
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.primitives import VectorLogSink
-from runs import run_scenario, scenario
+from runs import scenario
 
 import drake_dae as dd
 from drake_dae.diagrams import LoopSettings
@@ -36,9 +36,10 @@ def test_a_direct_connection_that_loops_is_refused_with_the_remedy():
 def test_a_sampled_loop_that_diverges_is_refused():
     with pytest.raises(WiringError, match=r"1.5"):
         rigid(dd.ForceSensor(1, sample_period=0.01), gain=1.5)
-    # With a lag of five samples it is stable up to (1 + a) / (1 - a), a = exp(-1/5): 10.
-    loop = rigid(dd.ForceSensor(1, time_constant=0.05, sample_period=0.01), gain=5.0)
-    assert loop.sensor.largest_stable_gain() == pytest.approx(10.03, abs=0.01)
+    # With a lag of five samples it is stable up to (1 + a) / (1 - a), a = exp(-1/5): 10.033.
+    rigid(dd.ForceSensor(1, time_constant=0.05, sample_period=0.01), gain=10.02)
+    with pytest.raises(WiringError, match="force_gain"):
+        rigid(dd.ForceSensor(1, time_constant=0.05, sample_period=0.01), gain=10.04)
 
 
 def test_a_sensor_that_no_law_uses_is_refused():
@@ -47,15 +48,8 @@ def test_a_sensor_that_no_law_uses_is_refused():
 
 
 def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
-    with pytest.raises(RuntimeError, match=r"two_link.*size 1.*force_sensor.*size 2"):
+    with pytest.raises(WiringError, match=r"two_link.*size 1.*force_sensor.*size 2"):
         rigid(dd.ForceSensor(2, time_constant=0.01))
-
-
-@pytest.mark.slow
-def test_a_plant_of_another_diagram_is_refused_with_its_name():
-    loop, _ = dd.build_scenario(scenario("two_link_wall"))
-    with pytest.raises(RuntimeError, match="'two_link_arm'"):
-        dd.make_closed_loop(loop.plant, loop.controller.law, loop.generator.references)
 
 
 def test_behind_motors_the_force_may_be_connected_directly():
@@ -81,27 +75,6 @@ def test_all_signals_are_in_one_log_of_which_the_record_is_cut(name):
         port = loop.diagram.GetOutputPort(signal)
         np.testing.assert_array_equal(record[signal], [port.Eval(context)], err_msg=signal)
         assert record.signals[signal].signals == names
-
-
-@pytest.mark.slow
-def test_a_scenario_with_another_mass_in_the_plant():
-    """Feedback shrinks the force error to 1 / (1 + 4) of what it is without, within 5 %."""
-    quiet = (
-        "duration=2",
-        "sensors.force.noise_deviation=[0]",
-        "sensors.force.time_constant=0.002",
-        "references.wall.force.frequencies=[0.5]",
-    )
-    loop, _, record = run_scenario(scenario("two_link_measured_force", *quiet))
-    plant = loop.plant.GetMyContextFromRoot(loop.diagram.CreateDefaultContext())
-    assert loop.plant.get_parameter(plant, "link2.mass") == pytest.approx([6.0])
-    *_, without = run_scenario(
-        scenario("two_link_measured_force", *quiet, "sensors.force=null", "law.force_gain=0")
-    )
-    errors = [np.max(np.abs(r["tracking_error"][r.time > 0.5, 1])) for r in (record, without)]
-    assert errors[1] > 1.0
-    assert errors[0] / errors[1] == pytest.approx(0.2, rel=0.05)
-    assert "measured_force" in record.signals
 
 
 @pytest.mark.slow

@@ -198,6 +198,6 @@ def first_of_search(site: Path, question: str, folder: Path) -> list[str]:
     """The addresses of the first three pages that the search of the site finds."""
     address = f"{(site / 'search.html').as_uri()}?q={quote(question)}"
     words = [CHROMIUM, *OPTIONS, f"--user-data-dir={folder / 'profile'}", BUDGET, "--dump-dom"]
-    done = subprocess.run([*words, address], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([*words, address], capture_output=True, text=True, timeout=600)
     found = re.findall(r'<li class="kind-\w+"><a href="([^"?#]*)', done.stdout)
     return list(dict.fromkeys(found))[:3]

@@ -8,7 +8,7 @@ import pytest
 from runs import some
 
 from drake_dae.pictures.page.page import in_pieces
-from drake_dae.trace.compiled import find_compiler, generate, without_branches
+from drake_dae.trace.compiled import generate, library, without_branches
 
 
 def long_function(name, looks_up=False):
@@ -29,20 +29,15 @@ def long_function(name, looks_up=False):
     return ca.Function(name, [x, y], [ca.cse(ca.vertcat(*column[-10:])), first])
 
 
-def library(source, folder):
-    find_compiler().compile(source, folder / "code", "-O1", 60.0)
-    return ca.external("long_one", str(folder / "code.so"))
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 @pytest.mark.parametrize("looks_up", some([False, True], first=1))
-def test_pieces_compute_what_the_whole_does(tmp_path, looks_up):
+def test_pieces_compute_what_the_whole_does(looks_up):
     whole = long_function("long_one", looks_up)
     source = generate(whole)
     pieces = in_pieces(without_branches(source), 30)
     assert pieces.count("noinline") > 120 // 30
-    own = library(pieces, tmp_path)
+    own = ca.external("long_one", str(library(pieces, 0, True, True)))
     rng = np.random.default_rng(3)
     for _ in range(20):
         x, y = rng.normal(size=6), rng.normal(size=3)

@@ -9,7 +9,7 @@ from runs import some
 
 from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
-from drake_dae.running.divergence import DivergenceWatch
+from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario, roll_scenario
 from tests.support.runs import scenario

@@ -113,11 +113,7 @@ REFUSED = {
             "tool.z: |order=2"
         ),
         f"{LINE} [0.3], limits: {{speed: 1}}}}": "references.tool.z.limits: ",
-        f"{LINE} [0.3], limits: {{speed: 1, acceleration: 0}}}}": (
-            "references.tool.z.limits: acceleration"
-        ),
         f"{LINE} [[1]], {GENTLE}}}": "references.tool.z: end",
-        f"{LINE} [0.2], {GENTLE}}}": "references.tool.z: start and end",
         "references.tool.z=!Circle {center: [0, 0], radius: 1, period: 2}": "references.tool.z: 2",
         f"references.tool.z=!Polyline {{points: [0, 1], corner: 1, {GENTLE}}}": (
             "references.tool.z.points.0: "
@@ -130,9 +126,6 @@ REFUSED = {
         ),
         "references.tool.z=!Csv {file: none.csv, columns: [z]}": "references.tool.z|/none.csv'",
         "references.tool.z=!Csv {file: 'a\0b', columns: [z]}": "references.tool.z",
-        f"references.tool.z=!Csv {{file: {find_scenario('biped')}, columns: [z]}}": (
-            "references.tool.z|'time'"
-        ),
         # The start.
         "start.positions.joint1=9": "start.positions: |9|-3.1416|3.1416",
         "start.errors.tool.x=1": "start.errors: |'tool.x'|tool.z",

@@ -10,7 +10,7 @@ from pydrake.geometry import Role, SceneGraph
 from drake_dae.errors import GeometryWarning
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scene.meshes import MOST_BYTES, shrink_meshes
+from drake_dae.scene.view import MOST_BYTES, shrink_meshes
 
 URDF = '<robot name="r"><link name="a">{}</link></robot>'
 VISUAL = '<visual name="v{}"><geometry><mesh filename="{}" scale="2 1 1"/></geometry></visual>'

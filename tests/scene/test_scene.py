@@ -19,8 +19,7 @@ import drake_dae as dd
 from drake_dae.pictures.motion import follow, run_points
 from drake_dae.robots import ConstraintWrenches
 from drake_dae.scene.arrows import ForceArrows
-from drake_dae.scene.camera import direction_of, framed
-from drake_dae.scene.surroundings import floor_below, surroundings
+from drake_dae.scene.surroundings import direction_of, floor_below, framed, surroundings
 from drake_dae.scene.view import draw_scene
 
 

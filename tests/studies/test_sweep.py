@@ -141,7 +141,7 @@ def test_a_script_needs_no_guard_for_its_processes(tmp_path):
         f"print(dd.sweep(scenario, [{{}}, {{}}], {str(tmp_path / 'runs.db')!r}, workers=2).results)"
     )
     done = subprocess.run(
-        [sys.executable, script], check=True, capture_output=True, text=True, timeout=100
+        [sys.executable, script], check=True, capture_output=True, text=True, timeout=600
     )
     assert done.stderr == ""  # The workers leave nothing behind.
     assert done.stdout.count("once") == 1
@@ -188,7 +188,7 @@ def test_ctrl_c_keeps_what_has_ended(tmp_path):
     process = subprocess.Popen(call, stderr=subprocess.PIPE, text=True)
     wait_for(3, folder / "runs.db", process)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=600)
     assert process.returncode == 130
     kept = f"runs that have ended are in {folder}/runs.db; the same command continues"
     assert said.splitlines() == [kept, "interrupted"]
@@ -210,7 +210,7 @@ def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
     )
     wait_for(3, tmp_path / "runs.db", process)
     os.kill(worker_of(process), signal.SIGKILL)
-    said, _ = process.communicate(timeout=100)
+    said, _ = process.communicate(timeout=600)
     assert process.returncode == 1
     words = " ".join(said.split())  # Lines are filled.
     assert words.startswith("6 runs: 5 finished, 1 crashed run 3, ")
@@ -236,7 +236,7 @@ def test_a_run_without_end_is_ended_at_the_limit(tmp_path):
         stderr=subprocess.PIPE,
         text=True,
     )
-    said, error = process.communicate(timeout=100)
+    said, error = process.communicate(timeout=600)
     assert process.returncode == 1
     words = " ".join(said.split())  # Lines are filled.
     assert words.startswith(

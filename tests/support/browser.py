@@ -98,7 +98,7 @@ def opened(address: str, profile: Path, width: int = 1000, height: int = 700):
     """What the script of a page returns that Chromium opens, in virtual time."""
     more = f"--window-size={width},{height}", f"--user-data-dir={profile}", BUDGET
     command = [CHROMIUM, *OPTIONS, *more, "--dump-dom", address]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     found = _RESULT.search(done.stdout)
     assert found, f"the page has no result: {done.stderr[-2000:]}"
     result = json.loads(unescape(found[1]))
@@ -145,6 +145,6 @@ def shown(
     with tempfile.TemporaryDirectory() as user:
         command = [CHROMIUM, *OPTIONS, *flags, f"--user-data-dir={user}", f"--window-size={size}"]
         command += ["--virtual-time-budget=8000", "--dump-dom", copy.as_uri() + fragment]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True)
     (found,) = re.findall(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)
     return found

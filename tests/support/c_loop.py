@@ -10,8 +10,8 @@ from pydrake.systems.framework import Context
 
 from drake_dae import ClosedLoop
 from drake_dae.blocks.compose import compose
-from drake_dae.running.export.c_code import BlockCode
-from drake_dae.running.export.loop import check_traced, write_loop
+from drake_dae.running.c_code import BlockCode
+from drake_dae.running.export import check_traced, write_loop
 
 
 def code_of(loop: ClosedLoop, context: Context) -> BlockCode:

@@ -42,7 +42,7 @@ def shown_on_a_terminal(arguments, **options):
     except OSError:
         pass  # Linux says so when the other end is closed.
     os.close(ours)
-    assert process.wait(timeout=60) == 0
+    assert process.wait(timeout=600) == 0
     return shown.decode()
 
 

@@ -64,8 +64,6 @@ PAPER = (
     "gains",
     "law_model",
     "tracking",
-    "linearization",
-    "filters",
     "disturbance",
     "contact_gains",
     "one_direction",

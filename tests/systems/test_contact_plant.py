@@ -18,7 +18,7 @@ import drake_dae as dd
 from drake_dae.dae import find_constraint_structure
 from drake_dae.errors import ScenarioError, WiringError
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.contact_material import ball_properties, surface_properties
+from drake_dae.systems.contact_plant import proximity
 
 # Without damping a compliant contact swings for ever. A ball without extension does not roll.
 CONTACT = (
@@ -177,9 +177,9 @@ def test_the_stiffness_of_a_hydroelastic_contact_is_drakes(sphere):
     plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
     ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(1.0, 0.02))
     round_form = geometry.Sphere(material.radius)
-    own, other = ball_properties(material, 0.0), geometry.ProximityProperties()
+    own, other = proximity(material, 0.0), geometry.ProximityProperties()
     if sphere is None:
-        other = surface_properties(material, 0.0, is_half_space=True)
+        other = proximity(material, 0.0, geometry.HalfSpace())
     else:
         geometry.AddCompliantHydroelasticProperties(sphere / 16.0, material.modulus, other)
         geometry.AddContactMaterial(1.0, None, CoulombFriction(0.0, 0.0), other)

@@ -24,7 +24,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.dae import with_disturbance
-from drake_dae.dae.filters import ChainFilter, transition
+from drake_dae.dae.disturbance import ChainFilter, transition
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import roll_scenario
 from drake_dae.systems import ControlHold, Observing

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from drake_dae import JointFriction, RobotModel, StateEstimator, TrackingLaw, poles
 from drake_dae.dae import with_disturbance
-from drake_dae.dae.filters import ChainFilter
+from drake_dae.dae.disturbance import ChainFilter
 from drake_dae.systems import Observing
 
 T = 1e-3

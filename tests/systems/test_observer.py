@@ -35,7 +35,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.dae import ConstraintStructure, with_disturbance
-from drake_dae.dae.disturbance import beside, shares
+from drake_dae.dae.disturbance import orthogonal_part, shares
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems import Observing
@@ -299,10 +299,10 @@ def test_sharing_is_by_the_accelerations_that_forces_make():
     assert_allclose(evaluated(shares, column, nothing, moves, metric, d), wanted, rtol=1e-10)
     other = random.standard_normal((4, 1))
     planes = np.hstack([column, other, 2.0 * column])
-    left = evaluated(beside, planes, metric, d)
+    left = evaluated(orthogonal_part, planes, metric, d)
     assert_allclose(planes.T @ matrix @ left, 0.0, atol=1e-10)
     assert_allclose(np.cross((d - left)[:3], column[:3, 0]) @ other[:3, 0], 0.0, atol=1e-8)
-    assert_allclose(evaluated(beside, 0.0 * planes, metric, d), d)
+    assert_allclose(evaluated(orthogonal_part, 0.0 * planes, metric, d), d)
     assert_allclose(evaluated(shares, 0.0 * column, nothing, moves, metric, d), 0.0)
 
 

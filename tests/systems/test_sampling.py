@@ -200,7 +200,7 @@ def test_sampling_refuses_times_that_are_none(numbers, name):
 def test_limits_that_are_none_are_refused():
     with pytest.raises(ModelError, match=r"\b0\b"):
         dd.ControlLimits([1.0, 0.0])
-    with pytest.raises(RuntimeError, match=r"size 1.*control_limits.*size 2"):
+    with pytest.raises(WiringError, match=r"size 1.*control_limits.*size 2"):
         pursue(dd.ConstantReference(0.0), None, 1.0, control_limits=[1.0, 1.0])
 
 

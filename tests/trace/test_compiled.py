@@ -165,7 +165,7 @@ print(f(np.arange(20.0))[0].sum(), f.is_machine_code)
 def test_processes_share_the_cache_and_code_is_kept_for_each_compiler(cache, monkeypatch):
     command = [sys.executable, "-W", "error", "-c", PROCESS]
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    printed = [process.communicate(timeout=120)[0] for process in running]
+    printed = [process.communicate(timeout=600)[0] for process in running]
     assert len(set(printed)) == 1
     assert printed[0].split()[1] == "True"
     assert cache.stat().st_mode & 0o777 == 0o700

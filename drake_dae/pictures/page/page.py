@@ -29,8 +29,8 @@ from drake_dae.pictures.page.controls import (
     strongest_pushes,
 )
 from drake_dae.pictures.page.scene import RobotScene, meshcat_page, scene_size
-from drake_dae.running.export.c_code import BlockCode
-from drake_dae.running.export.loop import check_traced, write_loop
+from drake_dae.running.c_code import BlockCode
+from drake_dae.running.export import check_traced, write_loop
 from drake_dae.trace.compiled import compile_webassembly
 
 WEB = Path(__file__).with_name("web")

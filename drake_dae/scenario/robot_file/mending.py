@@ -1,11 +1,11 @@
 """Copies of a robot's files, mended so that Drake's parser reads them as their authors mean them.
 
-A copy has possible inertias, and geometry that can be read and drawn; it lacks what Drake does not
-read. What changed on the way is collected, and so is what is lost.
+A copy has possible inertias, and geometry that can be read and drawn; it lacks what is not read.
+What changed on the way is collected, and so is what is lost.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Collection
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,18 @@ from pydrake.multibody.tree import RotationalInertia
 
 from drake_dae.arrays import FloatArray, number_in
 from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning
-from drake_dae.scenario.robot_file import mjcf
-from drake_dae.scenario.robot_file.files import RobotFiles, drawable
-from drake_dae.scenario.robot_file.read_by_drake import DRIVES, READ_BY_DRAKE, take_lost
-from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.robot_file.xml_tree import check_included, read_xml, write_xml
+from drake_dae.scenario.robot_file.read_by_drake import (
+    DRIVES,
+    READ_BY_DRAKE,
+    place_of,
+    read_xml,
+    take_lost,
+    write_xml,
+)
+from drake_dae.scenario.robot_file.robot import Robot, RobotFiles, drawable
 
-_ROUND = {"radius": 1, "length": 1}
-_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "capsule": _ROUND}
-_SIZES |= {"ellipsoid": {}, "mesh": {}}
-"""Shape -> how many numbers its sizes have, in URDF and SDFormat."""
+ARMATURE = "joint/armature"
+"""Rotor inertia of MJCF. Drake gives it to motors only."""
 
 _OF_MANY_AXES = ("planar", "floating", "universal", "ball", "free")
 """Types of joints that no motor drives, and that follow no other joint."""
@@ -34,89 +36,85 @@ _OF_MANY_AXES = ("planar", "floating", "universal", "ball", "free")
 _FLAT = 1e-8
 """A scale of a mesh up to which Drake takes none."""
 
+_EMPTY, _UNREAD = "has size 0", "has a shape that Drake does not read"
+
+_ROUND = {"radius": 1, "length": 1}
+_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "capsule": _ROUND}
+_SIZES |= {"ellipsoid": {}, "mesh": {}}
+"""Shape -> how many numbers its sizes have; those of a geom of MJCF are in one list."""
+
+_TURNS = {"quat", "axisangle", "euler", "xyaxes", "zaxis"}
+
+_SERVOS = ("position", "velocity", "intvelocity", "general")
+"""Actuators whose control is no effort, while their range of forces limits an effort."""
+
+_ACTUATORS = (*_SERVOS, "motor", "damper", "cylinder")
+"""What in a class has one default, under any of these names."""
+
+_LAW = ("dyntype", "gaintype", "biastype")
+
+_OF_GENERAL = {*_LAW, "dynprm", "gainprm", "biasprm"}
+"""What motors and servos set themselves, whatever is the default."""
+
 
 class Mender:
     """Makes mended copies of files. A "model" is the name of a model instance, "" for a lone robot.
 
-    `folder` is an empty one for the copies, None to make none; `shapes` has "read" if geometry is
-    read, and "drawn" if it is converted to be drawn.
+    `folder` is an empty one for the copies, None to make none; with `has_geometry` geometry is
+    read, and with `drawn` converted to be drawn.
     """
 
     def __init__(
-        self, files: RobotFiles, robot: Robot, folder: Path | None, shapes: Collection[str] = ()
+        self, files: RobotFiles, robot: Robot, folder: Path | None, has_geometry: bool, drawn: bool
     ) -> None:
         self.files, self.leave_out, self.folder = files, robot.leave_out, folder
         self.drives = robot.actuators is None  # Else the file's motors do not count.
-        self.has_geometry, self.drawn = "read" in shapes, "drawn" in shapes
+        self.has_geometry, self.drawn = has_geometry, drawn
+        # Links that the scenario places, so that no joint fixes them to the world.
+        self.placed = {*robot.free, *([robot.base.weld] if robot.base is not None else [])}
         # Category of a warning and its text -> what it concerns; part that is lost -> where.
         self.told: dict[tuple[type[Warning], str], list[str]] = defaultdict(list)
         self.lost: dict[str, list[str]] = defaultdict(list)
         self.originals: dict[Path, Path] = {}  # Copy -> its file.
-        # "effort" limit, "armature", "follows" (leader, ratio, offset), "parent" of SDFormat ->
-        # (model, joint) -> value.
-        self.joints: dict[str, dict[tuple[str, str], Any]] = defaultdict(dict)
+        # (model, joint) -> "effort" limit, "armature", "follows" (leader, ratio, offset), and the
+        # frame that is its "parent" in SDFormat.
+        self.joints: dict[tuple[str, str], dict[str, Any]] = defaultdict(dict)
         # Joints that the copies lack: model, name, child, and the frame that is their origin.
         self.floating: list[tuple[str, str, str, str]] = []
         self.crossed: set[tuple[str, str]] = set()  # (model, link) without a visual shape.
 
-    def copy(
-        self,
-        file: Path,
-        model: str = "",
-        placed: Collection[str] = (),
-        within: tuple[Path, ...] = (),
-    ) -> Path:
-        """A mended copy of a file; one that is neither URDF, SDFormat nor MJCF stays.
-
-        `placed` are links that the scenario places, so that no joint fixes them to the world, and
-        `within` the files that include this one.
-        """
+    def copy(self, file: Path, model: str = "") -> Path:
+        """A mended copy of a file; one that is neither URDF, SDFormat nor MJCF stays."""
         kind = file.suffix
         if kind not in READ_BY_DRAKE:
             return file
-        check_included(file, within)
-        root = read_xml(file)
-        if kind == ".xml":
-            for servo in mjcf.expand(root, file):
-                text = "servos become motors without their gains: controls are efforts"
-                self.tell(text, f"'{servo}'")
-        parents = {child: parent for parent in root.iter() for child in parent}
-
-        def place(node: Element) -> str:
-            """The line and name of an element, or of that to which it belongs."""
-            line = getattr(node, "line", 0)
-            while not node.get("name") and node in parents:
-                node = parents[node]
-            return f"{file.name}{f':{line}' * bool(line)}: {node.tag} '{node.get('name', '')}'"
-
-        for node in root.iter():
-            for value in (*node.attrib.values(), node.text or ""):
-                if "$(" in value or "${" in value:
-                    way = "is a template: xacro FILE -o robot.urdf writes the URDF"
-                    raise ModelError(f"{place(node)}: '{value.strip()}' {way}")
-                if "," in value and number_in(value.replace(",", ".", 1)) is not None:
-                    raise ModelError(f"{place(node)}: '{value}': numbers have a point, no comma")
-        # Only the armature of joints without motor is lost.
-        for one in take_lost(root, kind, {*self.leave_out} - {mjcf.ARMATURE}):
-            where = place(one.owner)
-            if one.is_told:
-                self.tell("Drake does not read, and leaves out", f"{where}: {one.part} {one.value}")
-            else:
-                self.lose(one.part, where)
-        for inertial in root.iter("inertial"):
-            if text := _mend_inertia(inertial, kind, place(inertial)):
-                self.lose("inertia", text)
-                self.tell("moments of inertia of no body become possible ones", text)
-        for joint in root.iter("joint"):
-            self._mend_limits(joint, place(joint))
-        if kind == ".urdf":
-            self._mend_urdf(root, file, model, placed)
-        elif kind == ".sdf":
+        with self.files.within(file):
+            root = read_xml(file)
+            if kind == ".xml":
+                self._expand(root, file)
+            for node in root.iter():
+                for value in (*node.attrib.values(), node.text or ""):
+                    if "$(" in value or "${" in value:
+                        way = "is a template: xacro FILE -o robot.urdf writes the URDF"
+                        raise ModelError(f"{place_of(node)}: '{value.strip()}' {way}")
+                    if "," in value and number_in(value.replace(",", ".", 1)) is not None:
+                        text = f"'{value}': numbers have a point, no comma"
+                        raise ModelError(f"{place_of(node)}: {text}")
+            # Only the armature of joints without motor is lost.
+            for part, place in take_lost(root, kind, {*self.leave_out} - {ARMATURE}):
+                self.lose(part, place)
+            for inertial in root.iter("inertial"):
+                if text := _mend_inertia(inertial, kind):
+                    self.lose("inertia", text)
+                    self.tell("moments of inertia of no body become possible ones", text)
             for joint in root.iter("joint"):
-                self._mend_axes(joint, place(joint))
-            self._mend_sdf(root, file, model, placed, (*within, file.resolve()))
-        else:
-            self._mend_mjcf(root, file, model, placed)
+                self._mend_limits(joint)
+            if kind == ".urdf":
+                self._mend_urdf(root, file, model)
+            elif kind == ".sdf":
+                self._mend_sdf(root, file, model)
+            else:
+                self._mend_mjcf(root, file, model)
         if self.folder is None:
             return file
         copy = self.folder / str(len(self.originals)) / file.name
@@ -132,33 +130,23 @@ class Mender:
         if part not in self.leave_out and (self.drives or not part.startswith(DRIVES)):
             self.lost[part].append(item)
 
-    def _mend_limits(self, joint: Element, place: str) -> None:
-        """Removes limits that Drake refuses, and those of joints that have none."""
+    def _mend_limits(self, joint: Element) -> None:
+        """Removes limits that Drake refuses, those of joints that have none, and speeds of 0."""
         is_continuous = joint.get("type") == "continuous"
         for owner in (joint, *joint.iterfind("limit"), *joint.iterfind("*/limit")):
-            sides = [owner.get(side) or owner.findtext(side) or "" for side in ("lower", "upper")]
-            bounds = [number_in(word) for word in owner.get("range", "").split() or sides]
+            keys = ("lower", "upper", "velocity")
+            sides = [owner.get(key) or owner.findtext(key) or "" for key in keys]
+            bounds = [number_in(word) for word in owner.get("range", "").split() or sides[:2]]
             low, high = bounds if len(bounds) == 2 else (None, None)
             is_reversed = low is not None and high is not None and low > high
             if is_reversed and not is_continuous:
-                self.lose("empty_limits", f"{place}: limits from {low:g} to {high:g}")
-            for key in ("range", "lower", "upper") if is_reversed or is_continuous else ():
+                self.lose("empty_limits", f"{place_of(joint)}: limits from {low:g} to {high:g}")
+            is_empty = low is not None and low == high and "empty_limits" in self.leave_out
+            gone = ["range", *keys[:2]] if is_continuous or is_reversed or is_empty else []
+            # Many authors write 0 for an unknown speed.
+            for key in (*gone, *keys[2:] * (number_in(sides[2]) == 0.0)):
                 owner.attrib.pop(key, None)
                 _remove(owner, key)
-
-    def _follow(self, model: str, joint: Element, tag: str) -> None:
-        """Takes out what a joint follows, unless Drake reports what is wrong."""
-        name = joint.get("name", "")
-        for mimic in [part for part in joint if part.tag == tag]:
-            ratio = number_in(mimic.get("multiplier", "1"))
-            offset = number_in(mimic.get("offset", "0"))
-            if joint.get("type") in _OF_MANY_AXES:
-                self.lose(f"joint/{tag}", f"joint '{name}'")
-            elif ratio is not None and offset is not None and "joint" in mimic.attrib:
-                joint.remove(mimic)
-                self.joints["follows"][model, name] = (mimic.get("joint"), ratio, offset)
-                if ratio == 0.0:
-                    self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
 
     # Geometry.
 
@@ -170,16 +158,13 @@ class Mender:
         """The file of a mesh as Drake reads it, of some kinds if any; "" if it is left out."""
         if self.folder is None:
             return str(path or "")
-        drawn, why = path, ""
+        drawn, why, way = path, "", "(robot.packages can name its folder)"
         if path is None:
-            why = (
-                "is in a package neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH "
-                "(robot.packages can name its folder)"
-            )
+            why = f"is in a package neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH {way}"
         elif not path.is_file():
             why = "is not there"
         elif not self.files.holds(path):
-            why = "is outside of the model's folder or package (robot.packages can name its folder)"
+            why = f"is outside of the model's folder or package {way}"
         elif kinds and (drawn := drawable(path, kinds)) is None:
             why = "cannot be converted (pip install 'drake_dae[meshes]' converts more)"
         elif collides and drawn and not _has_hull(str(drawn), drawn.stat().st_mtime_ns):
@@ -214,9 +199,39 @@ class Mender:
                 if _remove(material, "texture") + _remove(material, "drake:diffuse_map"):
                     self.tell("textures are left out", f"of '{name}'", GeometryWarning)
 
-    # URDF.
+    # URDF and SDFormat.
 
-    def _mend_urdf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
+    def _mend_joint(self, joint: Element, owner: Element, model: str) -> None:
+        name, kind = joint.get("name", ""), joint.get("type")
+        ends = joint.find("parent"), joint.find("child")
+        words = ("" if end is None else end.get("link") or end.text or "" for end in ends)
+        parent, child = map(str.strip, words)
+        of_file, is_placed = self.joints[model, name], parent == "world" and child in self.placed
+        of_file["parent"] = parent
+        if kind == "floating" or (kind == "fixed" and is_placed):
+            owner.remove(joint)
+        if kind == "floating" and not is_placed:
+            origin = joint.find("origin")
+            own = {"name": f"{name}_origin", "link": parent, "xyz": "0 0 0", "rpy": "0 0 0"}
+            SubElement(owner, "frame", own | ({} if origin is None else origin.attrib))
+            self.floating.append((model, name, child, own["name"]))
+        for limit in joint.iterfind("limit[@effort]"):
+            of_file["effort"] = number_in(limit.get("effort", "")) or 0.0
+        # What is wrong with a mimic is reported by Drake.
+        for mimic in (*joint.findall("mimic"), *joint.findall("drake:mimic")):
+            ratio = number_in(mimic.get("multiplier", "1"))
+            offset = number_in(mimic.get("offset", "0"))
+            if kind in _OF_MANY_AXES:
+                self.lose(f"joint/{mimic.tag}", f"joint '{name}'")
+            elif kind == "fixed":
+                joint.remove(mimic)
+            elif ratio is not None and offset is not None and "joint" in mimic.attrib:
+                joint.remove(mimic)
+                of_file["follows"] = (mimic.get("joint"), ratio, offset)
+                if ratio == 0.0:
+                    self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
+
+    def _mend_urdf(self, root: Element, file: Path, model: str) -> None:
         root.attrib.setdefault("name", file.stem)
         _remove(root, "mujoco")
         for link in root.iterfind("link") if self.has_geometry else ():
@@ -231,37 +246,21 @@ class Mender:
                 material[:] = colours.get(material.get("name") or material, [])
                 if not len(material):
                     owner.remove(material)
-        moving, still = set[str | None](), set[str | None]()  # Still are those without a motor.
-        for joint in (*root.findall("joint"), *root.findall("drake:joint")):
-            name, kind = joint.get("name", ""), joint.get("type")
-            ends = joint.find("parent"), joint.find("child")
-            parent, child = ("" if end is None else end.get("link", "") for end in ends)
-            if kind == "fixed":
-                _remove(joint, "mimic")
-            else:
-                moving.add(name)
-            if kind == "floating" or (kind == "fixed" and parent == "world" and child in placed):
-                root.remove(joint)
-            if kind == "floating" and not (parent == "world" and child in placed):
-                origin = joint.find("origin")
-                own = {"name": f"{name}_origin", "link": parent, "xyz": "0 0 0", "rpy": "0 0 0"}
-                SubElement(root, "frame", own | ({} if origin is None else origin.attrib))
-                self.floating.append((model, name, child, own["name"]))
-            self._follow(model, joint, "mimic")
-            still |= {name} if kind in _OF_MANY_AXES else set()
-            for limit in joint.iterfind("limit[@effort]"):
-                effort = number_in(limit.get("effort", "")) or 0.0
-                if effort > 0.0:
-                    self.joints["effort"][model, name] = effort
-                else:  # Many authors write 0 for an unknown limit.
-                    still.add(name)
+        joints = [*root.findall("joint"), *root.findall("drake:joint")]
+        for joint in joints:
+            self._mend_joint(joint, root, model)
+        # Many authors write 0 for an unknown limit, with which Drake makes no actuator.
+        kinds = {joint.get("name", ""): joint.get("type") for joint in joints}
+        still = {name for name in kinds if self.joints[model, name].get("effort") == 0.0}
+        still |= {name for name, kind in kinds.items() if kind in _OF_MANY_AXES}
+        moving = {name for name, kind in kinds.items() if kind != "fixed"}
         count = Counter[str]()
         for transmission in root.findall("transmission"):
-            driven = {joint.get("name") for joint in transmission.iterfind("joint")}
+            driven = {joint.get("name", "") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
-            for one in driven & still:
-                why = "its effort is 0, or it has more than one axis"
-                self.lose("transmission/joint", f"joint '{one}': {why}")
+            for name in driven & still:
+                text = f"joint '{name}': its effort is 0, or it has more than one axis"
+                self.lose("transmission/joint", text)
             if not has_type or not driven & moving or driven & still:
                 root.remove(transmission)
                 continue
@@ -270,74 +269,126 @@ class Mender:
                 count[name] += 1
                 actuator.set("name", f"{name}_{count[name]}" if count[name] > 1 else name)
 
-    # SDFormat.
-
-    def _mend_axes(self, joint: Element, place: str) -> None:
-        """Refuses two dampings, of which Drake reads one; writes the pitch of a screw in m."""
-        axes = (part for part in joint if part.tag in ("axis", "axis2"))
-        dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
-        if len({*map(number_in, dampings)}) > 1:
-            self.lose("axis2/damping", f"{place}: {' and '.join(dampings)}")
-        pitch = joint.find("thread_pitch")
-        if pitch is not None:  # In rad/m, of a thread that turns left.
-            joint.remove(pitch)
-            number = number_in(pitch.text or "")
-            if number == 0.0:
-                raise ModelError(f"{place}: with thread_pitch 0 it is no screw; mend the file")
-            if number is not None and joint.find("screw_thread_pitch") is None:
-                SubElement(joint, "screw_thread_pitch").text = repr(-2.0 * np.pi / number)
-
-    def _mend_sdf(
-        self,
-        root: Element,
-        file: Path,
-        model: str,
-        placed: Collection[str],
-        within: tuple[Path, ...],
-    ) -> None:
+    def _mend_sdf(self, root: Element, file: Path, model: str) -> None:
         for uri in root.iterfind(".//include/uri"):
             path = self.files.find((uri.text or "").strip(), file)
             if path is not None and path.is_dir():
                 path = next(iter(sorted(path.glob("*.sdf"))), None)
             if path is not None and path.is_file():
-                uri.text = self.copy(path, model, (), within).resolve().as_uri()
+                uri.text = self.copy(path, model).resolve().as_uri()
         for number, body in enumerate(root.iter("model")):
             body.attrib.setdefault("name", file.stem + f"_{number}" * bool(number))
             for link in body.iterfind("link") if self.has_geometry else ():
                 self._mend_shapes(link, file, model)
             for joint in body.findall("joint"):
-                parent, child = (joint.findtext(end, "").strip() for end in ("parent", "child"))
-                if parent == "world" and joint.get("type") == "fixed" and child in placed:
-                    body.remove(joint)
-                self.joints["parent"][model, joint.get("name", "")] = parent
-                self._follow(model, joint, "drake:mimic")
+                self._mend_joint(joint, body, model)
+        for joint in root.iter("joint"):
+            # Drake reads one of two dampings.
+            axes = (part for part in joint if part.tag in ("axis", "axis2"))
+            dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
+            if len({*map(number_in, dampings)}) > 1:
+                self.lose("axis2/damping", f"{place_of(joint)}: {' and '.join(dampings)}")
+            for pitch in joint.findall("thread_pitch"):  # In rad/m, of a thread that turns left.
+                if not (radians := number_in(pitch.text or "")):
+                    text = f"with thread_pitch {pitch.text} it is no screw; mend the file"
+                    raise ModelError(f"{place_of(joint)}: {text}")
+                pitch.tag, pitch.text = "screw_thread_pitch", repr(-2.0 * np.pi / radians)
 
-    # MJCF, which says all where it means it.
+    # MJCF: each element of the copy says all that it means, where it means it.
 
-    def _mend_mjcf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
+    def _expand(self, root: Element, file: Path) -> None:
+        """Puts included files and defaults of classes into their places, and mends what is there.
+
+        Inactive equalities go. Servos become motors, since controls are efforts here, and the
+        limits of motors those of the efforts at joints, the gear times those of motors. Bodies of
+        mass 0, which MuJoCo takes if they do not move or move with others, lose their inertia, and
+        their geometry its mass.
+        """
+        self._include(root, file)
+        root.attrib.setdefault("model", file.stem)
+        _apply_defaults(root)
+        options = _compiler(root)
+        if options.get("coordinate") == "global":
+            way = "MuJoCo up to 2.3.2 reads it, and saves it with local ones"
+            raise ModelError(f"'{file.name}' has global coordinates; {way}")
+        for equality in root.iterfind("equality"):
+            for constraint in list(equality):
+                if constraint.attrib.pop("active", "true") == "false":
+                    equality.remove(constraint)
+        for joint in root.iter("joint"):  # MuJoCo takes an empty range for none.
+            words = joint.get("range", "").split()
+            if joint.get("limited", "auto" if any(map(number_in, words)) else "false") == "false":
+                joint.attrib.pop("range", None)
+        kinds = {one.get("name", ""): one.get("type", "hinge") for one in root.iter("joint")}
+        kinds |= {one.get("name", ""): "free" for one in root.iter("freejoint")}
+        for owner, motor in [(one, motor) for one in root.iterfind("actuator") for motor in one]:
+            law = motor.attrib.keys() & _OF_GENERAL if motor.tag == "general" else set()
+            own, gain = {key: motor.attrib.pop(key) for key in law}, 1.0
+            if motor.tag == "general" and {own.get(k, "") for k in _LAW} <= {"", "none", "fixed"}:
+                motor.tag = "motor"  # Of a control in another unit.
+                gain = abs(_first(own.get("gainprm", "")))
+            elif motor.tag in _SERVOS:  # Its control is no effort, and neither are its limits.
+                motor.tag = "motor"
+                text = "servos become motors without their gains: controls are efforts"
+                self.tell(text, f"'{motor.get('name', motor.get('joint', ''))}'")
+                motor.attrib.pop("ctrlrange", None)
+                motor.attrib.pop("ctrllimited", None)
+            gear = abs(_first(motor.get("gear", "")))
+            for key, scale in (("ctrlrange", gain * gear), ("forcerange", gear)):
+                bounds = [number_in(word) for word in motor.get(key, "").split()]
+                if scale != 1.0 and bounds and None not in bounds:
+                    motor.set(key, " ".join(repr(scale * (bound or 0.0)) for bound in bounds))
+            kind = kinds.get(motor.get("joint", ""))
+            if motor.tag == "motor" and kind in _OF_MANY_AXES:
+                owner.remove(motor)
+                self.lose(f"{kind}/motor", place_of(motor))
+        for body in root.iter("body") if options.get("inertiafromgeom") != "true" else ():
+            inertial = body.find("inertial")
+            if inertial is not None and number_in(inertial.get("mass", "")) == 0.0:
+                body.remove(inertial)
+                for geom in body.iterfind("geom"):
+                    geom.set("mass", "0")
+        for geom in root.iter("geom"):
+            if _collides(geom):
+                geom.attrib.pop("contype", None)
+                geom.attrib.pop("conaffinity", None)
+            if "friction" in geom.attrib:  # Drake has none that resists turning.
+                geom.set("friction", "".join(geom.get("friction", "").split()[:1]))
+
+    def _include(self, owner: Element, main: Path) -> None:
+        for index, node in reversed(list(enumerate(owner))):
+            if node.tag != "include":
+                self._include(node, main)
+                continue
+            file = main.parent / node.get("file", "")
+            with self.files.within(file):
+                included = read_xml(file)
+                self._include(included, main)
+            for part in included.iter():
+                part.line = 0  # type: ignore[attr-defined]
+            owner[index : index + 1] = list(included)
+
+    def _mend_mjcf(self, root: Element, file: Path, model: str) -> None:
         self._mend_geoms(root, file, model)
         if not self.has_geometry:
             _remove(root, "contact")
-        kinds = {one.get("name", ""): one.get("type", "hinge") for one in root.iter("joint")}
-        kinds |= {one.get("name", ""): "free" for one in root.iter("freejoint")}
-        for owner in root.iterfind("actuator"):
-            for motor in owner.findall("motor"):
-                if (kind := kinds.get(motor.get("joint", ""))) in _OF_MANY_AXES:
-                    owner.remove(motor)
-                    name = motor.get("name", motor.get("joint"))
-                    self.lose(f"{kind}/motor", f"{file.name}: motor '{name}'")
         for joint in root.iter("joint"):
             name, armature = joint.get("name", ""), number_in(joint.get("armature", ""))
             if armature and name and joint.get("type", "hinge") in ("hinge", "slide"):
-                self.joints["armature"][model, name] = armature
+                self.joints[model, name]["armature"] = armature
             elif armature:
-                self.lose(mjcf.ARMATURE, f"{file.name}: of a joint that no motor can drive")
-        for name, free in mjcf.floating_bodies(root, placed):
-            self.floating.append((model, free, name, "world"))
+                self.lose(ARMATURE, f"{place_of(joint)}, which no motor can drive")
+        for body in root.iterfind("worldbody/body"):
+            name = body.get("name", "")
+            free = [*body.iterfind("freejoint"), *body.iterfind("joint[@type='free']")]
+            if free and name not in self.placed:
+                self.floating.append((model, free[0].get("name", name), name, "world"))
+            elif name in self.placed and not free and body.find("joint") is None:
+                SubElement(body, "freejoint")  # Else Drake welds it.
 
     def _mend_geoms(self, root: Element, file: Path, model: str) -> None:
         """Leaves out what of the geometry Drake cannot take, unless a body has its mass from it."""
-        options = mjcf.compiler(root)
+        options = _compiler(root)
         folder = file.resolve().parent / options.get("meshdir", options.get("assetdir", ""))
         meshes, used, shells = dict[str, Element](), dict[str, str](), set[str]()
         for asset in root.iterfind("asset/mesh"):
@@ -346,32 +397,32 @@ class Mender:
                 meshes[asset.get("name", "")] = asset
             if asset.attrib.pop("inertia", "") == "shell":
                 shells.add(asset.get("name", ""))
-        colliding = {geom.get("mesh") for geom in root.iter("geom") if mjcf.collides(geom)}
-        for geom, body, moves in mjcf.geoms(root):
-            name, mesh, fault = body.get("name", ""), geom.get("mesh", ""), mjcf.fault(geom)
-            weighs = moves and number_in(geom.get("mass", "1")) != 0.0
-            weighs &= mjcf.weighs_by_geometry(root) or body.find("inertial") is None
-            is_seen = self.has_geometry and (self.drawn or mjcf.collides(geom))
+        hulls = {geom.get("mesh") for geom in root.iter("geom") if _collides(geom)}
+        joints = "joint", "freejoint"
+        moved = [body for body in root.iter("body") if any(one.tag in joints for one in body)]
+        moving = {geom for body in moved for geom in body.iter("geom")}
+        bodies = [*root.iterfind("worldbody"), *root.iter("body")]
+        for body, geom in [(owner, geom) for owner in bodies for geom in owner.findall("geom")]:
+            name, mesh, fault = body.get("name", ""), geom.get("mesh", ""), _fault_of_geom(geom)
+            weighs = geom in moving and number_in(geom.get("mass", "1")) != 0.0
+            weighs &= options.get("inertiafromgeom") == "true" or body.find("inertial") is None
+            is_seen = self.has_geometry and (self.drawn or _collides(geom))
             if mesh in meshes and mesh not in used and (weighs or is_seen):
                 own = meshes[mesh].get("file", "")
-                is_hull = self.has_geometry and mesh in colliding
+                is_hull = self.has_geometry and mesh in hulls
                 used[mesh] = self._mesh(own, folder / own, is_hull, (".obj",))
                 meshes[mesh].set("file", used[mesh])
             is_refused = mesh in used and not used[mesh]
-            why = "" if fault == mjcf.EMPTY and "mass" not in geom.attrib else fault
-            if is_refused or mesh in shells:
-                why = (
-                    f"is the mesh '{mesh}', which Drake cannot read, or not as a shell (trimesh "
-                    "reads more: pip install 'drake_dae[meshes]')"
-                )
-            if weighs and why:
-                text = f"body '{name}' has its mass from geometry that {why}"
+            if is_refused or (weighs and mesh in shells):
+                fault = f"is the mesh '{mesh}', which Drake cannot read, or not as a shell"
+            if weighs and fault and (fault != _EMPTY or "mass" in geom.attrib):
+                text = f"body '{name}' has its mass from geometry that {fault}"
                 raise ModelError(f"{text}; give the body an <inertial>")
             if is_seen and is_refused:
                 self.crossed.add((model, name))
             elif is_seen and fault:
                 self._leave_out(fault, f"of '{name}'")
-            if is_refused or fault or not (weighs or is_seen):
+            if fault or not (weighs or is_seen):
                 body.remove(geom)
         for owner in root.iterfind("asset"):
             for asset in owner.findall("mesh"):
@@ -379,19 +430,78 @@ class Mender:
                     owner.remove(asset)
 
 
+def _apply_defaults(root: Element) -> None:
+    """Writes the defaults of its classes into each element of an MJCF file."""
+    classes: dict[str, dict[str, dict[str, str]]] = {}
+
+    def collect(default: Element, inherited: Mapping[str, dict[str, str]], name: str) -> None:
+        own = dict(inherited)
+        for node in default:
+            tag = "general" if node.tag in _ACTUATORS else node.tag
+            own[tag] = own.get(tag, {}) | node.attrib
+        classes[default.get("class", name)] = own
+        for child in default.iterfind("default"):
+            collect(child, own, "")
+
+    def apply(owner: Element, inherited: str) -> None:
+        for node in owner:
+            tag = "general" if owner.tag == "actuator" else node.tag
+            of_class = classes.get(node.attrib.pop("class", inherited), {})
+            values = of_class.get(tag, {}) if owner is not root else {}
+            gone = _TURNS if _TURNS & node.attrib.keys() else set()
+            gone = _OF_GENERAL if tag != node.tag else gone
+            known = {key: value for key, value in values.items() if key not in gone}
+            node.attrib.update(known | node.attrib)
+            apply(node, node.get("childclass", inherited))
+
+    for default in root.findall("default"):
+        collect(default, classes.get("main", {}), "main")
+        root.remove(default)
+    apply(root, "main")
+
+
+def _compiler(root: Element) -> dict[str, str]:
+    """The options of MuJoCo's compiler."""
+    return {key: value for one in root.iterfind("compiler") for key, value in one.items()}
+
+
+def _first(words: str) -> float:
+    """The first number, and 1 if there is none, or 0."""
+    return number_in([*words.split(), "1"][0]) or 1.0
+
+
+def _collides(geom: Element) -> bool:
+    """Whether a geometry of MJCF collides, and is not only drawn."""
+    return {geom.get("contype", "1"), geom.get("conaffinity", "1")} != {"0"}
+
+
+def _fault_of_geom(geom: Element) -> str:
+    """Why Drake takes no such shape of MJCF; "" if it does, or if it is a mesh."""
+    kind = "mesh" if "mesh" in geom.attrib else geom.get("type", "sphere")
+    if kind in ("mesh", "plane"):
+        return ""
+    if kind not in _SIZES:
+        return _UNREAD
+    sizes = [number_in(word) or 0.0 for word in geom.get("size", "").split()]
+    ends = geom.get("fromto", "").split()
+    count = 1 if ends else sum(_SIZES[kind].values()) or 3
+    is_empty = len(sizes) < count or min(sizes[:count]) <= 0.0
+    return _EMPTY if is_empty or (ends and ends[:3] == ends[3:]) else ""
+
+
 def _fault(form: Element, kind: str) -> str:
     """Why Drake takes no such shape of URDF or SDFormat; "" if it does."""
     sizes = _SIZES.get(form.tag.removeprefix("drake:"))
     if sizes is None and not (kind == ".sdf" and form.tag in ("plane", "empty")):
-        return mjcf.UNREAD
+        return _UNREAD
     for key in ("size", "radius", "length", "radii", "a", "b", "c", "scale"):
         words = (form.get(key) or form.findtext(key) or "").split()
         count = (sizes or {}).get(key, len(words))
         if len(words) != count and (words or kind == ".urdf"):
-            return mjcf.UNREAD
+            return _UNREAD
         numbers = [number_in(word) or 0.0 for word in words]
         if any(abs(number) <= _FLAT if key == "scale" else number <= 0.0 for number in numbers):
-            return mjcf.EMPTY
+            return _EMPTY
     return ""
 
 
@@ -407,14 +517,14 @@ def _has_hull(mesh: str, changed: int) -> bool:
 
 def _remove(owner: Element, tag: str) -> int:
     """Removes the children of a tag; returns how many there were."""
-    children = [child for child in owner if child.tag == tag]
+    children = owner.findall(tag)
     for child in children:
         owner.remove(child)
     return len(children)
 
 
 _ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-_ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+_PLACES = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])  # Of the entries in a matrix.
 
 
 def nearest_inertia(inertia: FloatArray) -> FloatArray:
@@ -431,60 +541,53 @@ def nearest_inertia(inertia: FloatArray) -> FloatArray:
     return np.asarray((axes * (second.sum() - second)) @ axes.T)
 
 
-def _mend_inertia(inertial: Element, kind: str, place: str) -> str:
+def _mend_inertia(inertial: Element, kind: str) -> str:
     """Replaces an impossible inertia by the nearest possible one; says what it replaced, or ""."""
-    words = _mass_and_entries(inertial, kind)
-    numbers = [number_in(word) for word in words]
-    if None in numbers:
-        raise ModelError(f"{place}: mass and inertia are numbers, got {', '.join(words)}")
-    if len(numbers) != 7:
+    place, matrix = place_of(inertial), inertial.find("inertia")
+    # A fullinertia cannot be combined with a quat, so a diagonal one remains diagonal.
+    key = "fullinertia" if "fullinertia" in inertial.attrib else "diaginertia"
+    if kind == ".xml":
+        mass, words = inertial.get("mass", "0"), inertial.get(key, "").split()
+        words += ["0", "0", "0"] * (key == "diaginertia")
+    elif kind == ".urdf":
+        weight = inertial.find("mass")
+        mass = "0" if weight is None else weight.get("value", "0")
+        words = [] if matrix is None else [matrix.get(entry, "0") for entry in _ENTRIES]
+    else:  # The defaults of SDFormat are a unit matrix.
+        mass, own = inertial.findtext("mass", "1"), zip(_ENTRIES, "111000", strict=True)
+        words = [] if matrix is None else [matrix.findtext(entry, one) for entry, one in own]
+    if len(words) != 6:
         return ""  # Drake reports it.
-    mass, entries = numbers[0] or 0.0, np.array(numbers[1:], float)
-    if mass < 0.0:
-        raise ModelError(f"{place}: a mass is positive, got {mass:g} kg")
+    numbers = [number_in(word) for word in (mass, *words)]
+    if None in numbers:
+        raise ModelError(f"{place}: mass and inertia are numbers, got {mass}, {', '.join(words)}")
+    kilograms, *entries = np.array(numbers, float).tolist()
+    if kilograms < 0.0:
+        raise ModelError(f"{place}: a mass is positive, got {kilograms:g} kg")
     try:
-        is_possible = RotationalInertia(*entries.tolist()).CouldBePhysicallyValid()
+        is_possible = RotationalInertia(*entries).CouldBePhysicallyValid()
     except RuntimeError:
         is_possible = False
-    if not np.any(entries) if mass == 0.0 else is_possible:
+    if not any(entries) if kilograms == 0.0 else is_possible:
         return ""
-    inertia = np.empty((3, 3))
-    inertia[_ROWS, _COLUMNS] = inertia[_COLUMNS, _ROWS] = entries
-    nearest = nearest_inertia(inertia) if mass > 0.0 else np.zeros((3, 3))
+    inertia = np.array(entries)[_PLACES]
+    nearest = nearest_inertia(inertia) if kilograms > 0.0 else np.zeros((3, 3))
     before, after = np.linalg.eigvalsh(inertia), np.linalg.eigvalsh(nearest)
-    if mass > 0.0 and not np.trace(nearest) > 0.0:
+    if kilograms > 0.0 and not np.trace(nearest) > 0.0:
         raise ModelError(
             f"{place}: the moments of inertia are {before} kg m^2, and near these is none that a "
-            f"body of {mass:g} kg can have; mend them"
+            f"body of {kilograms:g} kg can have; mend them"
         )
-    written = [repr(float(entry)) for entry in nearest[_ROWS, _COLUMNS]]
-    if (matrix := inertial.find("inertia")) is None:
-        # A fullinertia cannot be combined with a quat, so a diagonal one remains diagonal.
-        key = "fullinertia" if "fullinertia" in inertial.attrib else "diaginertia"
+    written = [repr(entry) for entry in nearest[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()]
+    if matrix is None:
         inertial.set(key, " ".join(written[: 6 if key == "fullinertia" else 3]))
     else:
         matrix.clear()
-        for key, entry in zip(_ENTRIES, written, strict=True):
+        for entry, value in zip(_ENTRIES, written, strict=True):
             if kind == ".urdf":
-                matrix.set(key, entry)
+                matrix.set(entry, value)
             else:
-                SubElement(matrix, key).text = entry
+                SubElement(matrix, entry).text = value
     was, now = (", ".join(f"{d:.3g}" for d in moments) for moments in (before, after))
     change = 100.0 * np.linalg.norm(nearest - inertia) / np.linalg.norm(inertia)
     return f"{place}: ({was}) kg m^2, nearest possible ({now}), changed by {change:.2g} %"
-
-
-def _mass_and_entries(inertial: Element, kind: str) -> list[str]:
-    """Mass in kg, and xx, yy, zz, xy, xz and yz in kg m^2; none if entries are missing."""
-    matrix = inertial.find("inertia")
-    if kind == ".xml":
-        entries = inertial.get("fullinertia", inertial.get("diaginertia", "")).split()
-        return [inertial.get("mass", "0"), *entries, *["0"] * 3][: 7 if entries[2:] else 0]
-    if matrix is None:
-        return []
-    if kind == ".urdf":
-        mass = inertial.find("mass")
-        weight = "0" if mass is None else mass.get("value", "0")
-        return [weight, *(matrix.get(key, "0") for key in _ENTRIES)]
-    own = zip(_ENTRIES, "111000", strict=True)  # The defaults of SDFormat are a unit matrix.
-    return [inertial.findtext("mass", "1"), *(matrix.findtext(key, zero) for key, zero in own)]

@@ -1,30 +1,107 @@
-"""The elements and attributes of robot files that Drake's parser reads, one table per format.
+"""XML of robot files: its trees, and which elements and attributes are read, a table per format.
 
-A part of a file that Drake does not read and that changes masses, forces, constraints or limits is
-lost, and a run without it is one of another robot. So whatever is not in the table is an error,
-until the scenario names it under `robot.leave_out`, as "<parent>/<name>": "joint/stiffness",
-"gazebo/joint". The tables follow Drake's page "Parsing Models for Multibody Dynamics", and those of
-the formats; a test feeds them through Drake.
+A part of a file that is not read and that changes masses, forces, constraints or limits is lost,
+and a run without it is one of another robot. So whatever is not in the table is an error, until the
+scenario names it under `robot.leave_out`, as "<parent>/<name>": "joint/stiffness", "gazebo/joint".
+The tables follow Drake's page "Parsing Models for Multibody Dynamics", without constraints and
+bushings that are no part of the library's equations; a test feeds them through Drake.
 """
 
-from collections.abc import Callable, Collection, Iterator
-from typing import NamedTuple
-from xml.etree.ElementTree import Element
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+from xml.sax.saxutils import escape, quoteattr
 
 from drake_dae.arrays import number_in
+from drake_dae.errors import ModelError
+from drake_dae.files import read_bytes
 
-# "owner: parts that Drake reads | parts that change no equation | parts that are reported".
-# Of "a=0" that holds with this value only, of "a=never" with none; "*" is all others. Owners
-# without a line hold geometry. "limit@ball" has what is different in joints of this type.
+DEEPEST = 200
+"""The largest number of elements inside each other."""
+
+
+class Node(Element):
+    """An element of XML, and where it is: 0 and "" if it is not of the file."""
+
+    line, place = 0, ""  # "arm.urdf:12: link 'hand'": the name of it, or of what it belongs to.
+
+
+def place_of(element: Element) -> str:
+    """Where an element is in its file, and its name."""
+    return getattr(element, "place", "")
+
+
+def read_xml(file: Path) -> Node:
+    """The root of an XML file, without entities and comments.
+
+    Like Drake it takes prefixes that are not declared, such as `drake:`, as parts of names.
+    """
+    try:
+        data = read_bytes(file)
+    except (OSError, ValueError) as error:
+        raise ModelError(f"no file '{file}': {getattr(error, 'strerror', error)}") from None
+    text = data.lstrip()  # Drake takes blank lines before the declaration.
+    skipped, named = data[: len(data) - len(text)].count(b"\n"), list[str]()
+    builder, parser = TreeBuilder(element_factory=Node), expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        own = attributes.get("name", "")
+        named.append(f"{tag} '{own}'" if own or not named else named[-1])
+        if len(named) > DEEPEST:
+            raise ModelError(f"'{file.name}' nests more than {DEEPEST} elements")
+        node: Node = builder.start(tag, attributes)  # type: ignore[assignment]
+        node.line = skipped + parser.CurrentLineNumber
+        node.place = f"{file.name}:{node.line}: {named[-1]}"
+
+    def end(tag: str) -> None:
+        named.pop()
+        builder.end(tag)
+
+    def refuse_entity(name: str, *_: object) -> None:
+        raise ModelError(f"'{file.name}' declares the entity '{name}': none are read")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, refuse_entity
+    try:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
+        line = skipped + error.lineno
+        raise ModelError(f"{file}:{line}: no XML: {expat.ErrorString(error.code)}") from None
+    root: Node = builder.close()  # type: ignore[assignment]
+    return root
+
+
+def write_xml(root: Element) -> str:
+    """The text of a tree, whose elements stand in the lines that they had."""
+    pieces: list[str] = []
+    line = 1
+
+    def put(node: Element) -> None:
+        nonlocal line
+        breaks = max(0, getattr(node, "line", 0) - line)
+        attributes = "".join(f" {name}={quoteattr(value)}" for name, value in node.items())
+        text = escape((node.text or "").strip())
+        pieces.append("\n" * breaks + f"<{node.tag}{attributes}>{text}")
+        line += breaks + text.count("\n")
+        for child in node:
+            put(child)
+        pieces.append(f"</{node.tag}>")
+
+    put(root)
+    return "".join(pieces)
+
+
+# "owner: parts that are read | parts that change no equation | limits that are not read". Of "a=0"
+# that holds with this value only, of "a=never" with none; "*" is all others. Owners without a line
+# hold geometry. "limit@ball,screw" has what is different in joints of these types.
 _URDF = """
-robot: name material link joint drake:joint transmission frame gazebo drake:linear_bushing_rpy
-robot: drake:linear_spring_damper drake:ball_constraint drake:distance_constraint
-robot: drake:tendon_constraint drake:collision_filter_group
+robot: name material link joint drake:joint transmission frame gazebo drake:linear_spring_damper
+robot: drake:distance_constraint drake:collision_filter_group mujoco
 robot: | version sensor ros2_control disable_collisions link_group group verbose plugin
-robot: mujoco
 mujoco: compiler option | *
-compiler: | * | boundmass=0 boundinertia=0 settotalmass=-1 inertiafromgeom=auto
-option: | * | gravity=earth density=0 viscosity=0 wind=0
+compiler: | * boundmass=0 boundinertia=0 settotalmass=-1 inertiafromgeom=0
+option: | * gravity=0,0,-9.81/0,0,-9.8 density=0 viscosity=0 wind=0
 gazebo: | * reference joint=never constraint=never gravity=1 turnGravityOff=0 springStiffness=0
 gazebo: velocity_decay | dampingFactor=0 kinematic=0 static=0 link=never model=never axis=never
 gazebo: | inertial=never
@@ -43,11 +120,8 @@ joint: | mechanical_reduction offset sensor disable_collision
 origin: xyz rpy
 axis: xyz | rpy
 limit: lower upper velocity effort drake:acceleration
-limit@floating limit@planar limit@ball limit@universal limit@screw limit@curvilinear: || lower
-limit@floating limit@planar limit@ball limit@universal limit@screw limit@curvilinear: || upper
-limit@floating limit@planar limit@ball limit@universal limit@screw limit@curvilinear: || velocity
-limit@floating limit@planar limit@ball limit@universal: || drake:acceleration
-limit@screw limit@curvilinear: || drake:acceleration effort
+limit@floating,planar,ball,universal,screw: || lower upper velocity drake:acceleration
+limit@screw: || effort
 dynamics: damping | coulomb_window friction=0
 dynamics@floating: | damping=0
 mimic: joint multiplier offset
@@ -60,11 +134,11 @@ actuator: | hardwareInterface mechanicalReduction mechanical_reduction role
 _SDF = """
 sdf: version model world | light actor
 world: name model frame include joint | light scene physics gui plugin atmosphere wind
-world: | gravity=earth magnetic_field spherical_coordinates audio state population road actor
+world: | gravity=0,0,-9.81/0,0,-9.8 magnetic_field spherical_coordinates audio state population
+world: | road actor
 include: uri name pose placement_frame static merge | plugin experimental:params=never
 model: name canonical_link placement_frame pose static link joint frame include model
-model: drake:joint drake:linear_bushing_rpy drake:linear_spring_damper drake:ball_constraint
-model: drake:distance_constraint drake:tendon_constraint drake:collision_filter_group
+model: drake:joint drake:linear_spring_damper drake:distance_constraint drake:collision_filter_group
 model: | enable_wind=0 self_collide allow_auto_disable plugin gripper
 link: name pose inertial visual collision drake:visual drake:surface_velocity_axis velocity_decay
 link: | gravity=1 kinematic=0 enable_wind=0 self_collide must_be_base_link sensor light
@@ -75,30 +149,24 @@ inertia: ixx iyy izz ixy ixz iyz
 joint: name type parent child pose axis axis2 screw_thread_pitch thread_pitch drake:rotor_inertia
 joint: drake:gear_ratio drake:controller_gains drake:mimic
 joint: | sensor plugin physics gearbox_ratio gearbox_reference_body
-joint@revolute joint@prismatic joint@continuous joint@ball joint@fixed: | axis2 thread_pitch
-joint@screw: | axis2
-joint@universal: | thread_pitch
+joint@revolute,prismatic,continuous,ball,fixed,screw: | axis2
+joint@revolute,prismatic,continuous,ball,fixed,universal: | thread_pitch
 axis axis2: xyz limit dynamics use_parent_model_frame | initial_position
 limit: lower upper effort velocity drake:acceleration | stiffness dissipation
-limit@ball limit@universal limit@screw: || lower upper velocity drake:acceleration
-limit@ball limit@universal: || effort
+limit@ball,universal,screw: || lower upper velocity drake:acceleration
+limit@ball,universal: || effort
 dynamics: damping spring_reference spring_stiffness | friction=0
-dynamics@ball dynamics@universal dynamics@screw: | spring_reference spring_stiffness=0
+dynamics@ball,universal,screw: | spring_reference spring_stiffness=0
 """
 
 _MJCF = """
-mujoco: model compiler option asset worldbody body actuator contact equality
-mujoco: | size statistic sensor keyframe visual custom extension
+mujoco: model compiler option asset worldbody body actuator contact
+mujoco: equality | size statistic sensor keyframe visual custom extension
 compiler: coordinate angle assetdir meshdir eulerseq inertiafromgeom autolimits
-compiler: | boundmass=0 boundinertia=0 settotalmass=-1 balanceinertia=0 inertiagrouprange=0_5
-compiler: | strippath=0
-compiler: | usethread texturedir discardvisual fusestatic fitaabb saveinertial alignfree convexhull
-compiler: | exactmeshinertia conflictcheck lengthrange
-option: gravity flag | density=0 viscosity=0 wind=0
-option: | timestep apirate impratio magnetic o_margin o_solref o_solimp o_friction integrator cone
-option: | jacobian solver iterations tolerance ls_iterations ls_tolerance noslip_iterations
-option: | noslip_tolerance ccd_iterations ccd_tolerance mpr_iterations mpr_tolerance sdf_iterations
-option: | sdf_tolerance sdf_initpoints actuatorgroupdisable collision sleep_tolerance
+compiler: | boundmass=0 boundinertia=0 settotalmass=-1 balanceinertia=0 inertiagrouprange=0,5
+compiler: | strippath=0 usethread texturedir discardvisual fusestatic fitaabb saveinertial
+compiler: | alignfree convexhull exactmeshinertia conflictcheck lengthrange
+option: gravity flag | * density=0 viscosity=0 wind=0
 flag: | * constraint=enable equality=enable frictionloss=enable limit=enable passive=enable
 flag: | spring=enable damper=enable gravity=enable clampctrl=enable actuation=enable
 worldbody body: name pos quat axisangle euler xyaxes zaxis body geom joint freejoint inertial
@@ -111,14 +179,13 @@ joint@free: | damping=0 range
 joint@ball: || range
 freejoint: name | group align class user
 geom: name type pos quat axisangle euler xyaxes zaxis size fromto mesh mass density contype
-geom: conaffinity group material rgba friction | shellinertia=0 fluidshape=ellipsoidal class condim
+geom: conaffinity group material rgba friction | shellinertia=0 fluidshape=none class condim
 geom: | priority solmix solref solimp margin gap fitscale user hfield fluidcoef
 actuator: motor
 motor: name joint gear ctrlrange=+- ctrllimited forcerange=+- forcelimited
 motor: | group lengthrange user kp kv dampratio timeconst inheritrange cranklength actearly actdim
 motor: | actlimited actrange nsample interp delay
-equality: connect
-connect: name body1 body2 anchor | class solref solimp
+equality: | *=never
 asset: mesh material | texture hfield skin
 mesh: name file scale inertia | *
 """
@@ -127,76 +194,56 @@ DRIVES = ("transmission/", "actuator/", "motor/", "ball/motor", "free/motor")
 """Parts that only drive joints: nothing of them is lost if the scenario names the driven joints."""
 
 
-def _is_symmetric(value: str) -> bool:
-    low, high = [*(number_in(word) for word in value.split()), None, None][:2]
-    return low is None or high is None or low == -high
+def _words(text: str) -> list[str | float]:
+    """The words of a value, with numbers for those that are or mean numbers."""
+    words = [{"true": "1", "false": "0", "auto": "0"}.get(w, w) for w in text.lower().split()]
+    return [word if (number := number_in(word)) is None else number for word in words]
 
 
-_RULES: dict[str, Callable[[str], bool]] = {
-    "": lambda _: True,
-    "never": lambda _: False,
-    "0": lambda value: (
-        value.lower() in ("false", "auto") or all(number_in(word) == 0.0 for word in value.split())
-    ),
-    "1": lambda value: value.lower() in ("", "true") or number_in(value) == 1.0,
-    "+-": _is_symmetric,
-    "-1": lambda value: (number_in(value) or 0.0) <= 0.0,
-    "0_5": lambda value: value.split() == ["0", "5"],
-    "simple": lambda value: "SimpleTransmission" in value,
-    "earth": lambda value: value.split() in (["0", "0", "-9.8"], ["0", "0", "-9.81"]),
-    "enable": lambda value: value == "enable",
-    "ellipsoidal": lambda value: value == "none",
-    "auto": lambda value: value in ("false", "auto"),
-    "unlimited": lambda value: (
-        not any(0.0 < abs(number_in(word) or 0.0) < 1e16 for word in value.split())
-    ),
-}
-"""A value in the tables -> whether one in a file means the same."""
+def _is_meant(value: str, meant: str) -> bool:
+    """Whether a value in a file means the same as one in the tables."""
+    words, numbers = _words(value), [number_in(word) for word in value.split()]
+    match meant:
+        case "":
+            return True
+        case "0" | "1":
+            return {*words} <= {float(meant)}
+        case "+-":  # A range of both directions.
+            low, high = [*numbers, None, None][:2]
+            return low is None or high is None or low == -high
+        case "unlimited":
+            return not any(0.0 < abs(number or 0.0) < 1e16 for number in numbers)
+        case "simple":
+            return "SimpleTransmission" in value
+    return words in [_words(way.replace(",", " ")) for way in meant.split("/")]
 
 
-class _Part(NamedTuple):
-    """How Drake takes a part: it reads it, a value of it is without effect, or it is reported."""
-
-    is_read: bool = False
-    meant: str = "never"
-    is_told: bool = False
-
-
-def _table(text: str) -> dict[str, dict[str, _Part]]:
-    """Owner -> its parts."""
-    table: dict[str, dict[str, _Part]] = {}
+def _table(text: str) -> dict[str, dict[str, tuple[bool, str]]]:
+    """Owner -> part -> whether it is read, and the values with which it changes no equation."""
+    table: dict[str, dict[str, tuple[bool, str]]] = {}
     for line in text.strip().splitlines():
         owners, _, parts = line.partition(": ")
         for owner in owners.split():
+            tag, _, types = owner.partition("@")
             for k, names in enumerate(parts.split("|")):
                 for part in names.split():
                     name, _, value = part.partition("=")
-                    meant = value or ("unlimited" if k == 2 else "")
-                    table.setdefault(owner, {})[name] = _Part(k == 0, meant, k == 2)
+                    own = k == 0, value or ("unlimited" if k == 2 else "")
+                    for joint in types.split(","):
+                        table.setdefault(f"{tag}@{joint}".rstrip("@"), {})[name] = own
     return table
 
 
 READ_BY_DRAKE = {".urdf": _table(_URDF), ".sdf": _table(_SDF), ".xml": _table(_MJCF)}
 
 
-class Lost(NamedTuple):
-    """What Drake does not read: "<parent>/<name>", its value, and the element to which it belongs.
-
-    What Drake does not read of joints of one type is "<type>/<name>". It is reported, or refused.
-    """
-
-    part: str
-    value: str
-    owner: Element
-    is_told: bool
-
-
 def take_lost(
     element: Element, kind: str, leave_out: Collection[str], joint: str = ""
-) -> Iterator[Lost]:
-    """Removes what Drake does not read of an element, and yields what is lost.
+) -> Iterator[tuple[str, str]]:
+    """Removes what is not read of an element, and yields what is lost, and where.
 
-    `joint` is the type of the joint to which the element belongs.
+    That is "<parent>/<name>", or "<type>/<name>" of what is lost of joints of one type. `joint` is
+    the type of the joint to which the element belongs.
     """
     tables = READ_BY_DRAKE[kind]
     if element.tag not in tables:
@@ -211,17 +258,17 @@ def take_lost(
         parts.append((child.tag, (child.text or "").strip() or child.get("value", ""), child))
     for name, value, node in parts:
         is_foreign = ":" in name and name not in table and not name.startswith("drake:")
-        other = _Part(name.startswith("xmlns"), "") if is_foreign else table.get("*", _Part(True))
-        known = table.get(name, other)
+        other = (name.startswith("xmlns"), "") if is_foreign else table.get("*", (False, "never"))
+        is_read, meant = table.get(name, other)
         part = f"{joint if name in of_type else element.tag}/{name}"
-        is_meant = _RULES[known.meant](value)
+        is_meant = _is_meant(value, meant)
         if not is_meant and part not in leave_out:
-            yield Lost(part, value, element, known.is_told)
-        if known.is_read and is_meant and part not in leave_out:
+            yield part, f"{place_of(element)}{f' {value}' * bool(value)}"
+        if is_read and is_meant and part not in leave_out:
             if node is not None:
                 yield from take_lost(node, kind, leave_out, joint)
                 own = tables.get(name, {})
-                if own and not any(part.is_read for part in own.values()):
+                if own and not any(is_read for is_read, _ in own.values()):
                     element.remove(node)
         elif node is not None:
             element.remove(node)

@@ -1,17 +1,23 @@
-"""Reads a robot's files into a MultibodyPlant, and into links of the library."""
+"""Reads a robot's files into a MultibodyPlant, with a scenario's changes, and into links.
+
+Loops of joints are cut; the joints at which they are cut become constraints.
+"""
 
 import logging
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
+from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import get_native_id
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import Box, SceneGraph
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import (
     FlattenModelDirectives,
     LoadModelDirectives,
@@ -20,27 +26,51 @@ from pydrake.multibody.parsing import (
     ProcessModelDirectives,
 )
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, QuaternionFloatingJoint, RpyFloatingJoint
-
-from drake_dae.errors import DrakeDaeError, ModelError
-from drake_dae.robots import Constraint, MultibodyExpressions, joint_names, plant_constraints
-from drake_dae.scenario.form import at
-from drake_dae.scenario.robot_file.changes import (
-    CutJoint,
-    add_payloads,
-    change_robot,
-    cut_loops,
-    joints_of,
-    loop_constraint,
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Frame,
+    JacobianWrtVariable,
+    Joint,
+    JointActuator,
+    JointIndex,
+    PrismaticJoint,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+    RpyFloatingJoint,
+    SpatialInertia,
+    UnitInertia,
+    WeldJoint,
 )
-from drake_dae.scenario.robot_file.files import RobotFiles
-from drake_dae.scenario.robot_file.mending import Mender
+
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.errors import DrakeDaeError, ModelError
+from drake_dae.robots import (
+    Constraint,
+    MultibodyExpressions,
+    PrismaticLoopJoint,
+    RevoluteLoopJoint,
+    axes_along,
+    frame_name,
+    frame_named,
+    joint_names,
+    triple,
+)
+from drake_dae.scenario.form import at
+from drake_dae.scenario.robot_file.mending import ARMATURE, Mender
 from drake_dae.scenario.robot_file.read_by_drake import DRIVES
-from drake_dae.scenario.robot_file.robot import Payload, Robot
-from drake_dae.scenario.robot_file.xml_tree import check_included
+from drake_dae.scenario.robot_file.robot import Payload, Robot, RobotFiles
 
 RobotLinks = tuple[MultibodyExpressions, list[Constraint]]
 """The links of a robot, and its loop-closing joints as constraints."""
+
+LoopMakers = dict[str, Callable[[MultibodyPlant], Constraint]]
+"""Joints that closed loops -> what makes their constraints, of the finalized plant."""
+
+_Facts = Mapping[JointIndex, Mapping[str, Any]]
+"""What a file says of joints: see `Mender.joints`."""
+
+_Leaders = Mapping[JointIndex, tuple[JointIndex, float, float]]
+"""Joints that follow others -> those, the ratio, and the offset, rad or m."""
 
 _REMEDIES = {
     "friction": "robot.known_forces has friction as a !JointFriction",
@@ -51,6 +81,11 @@ _REMEDIES = {
     "inertia": "it takes the nearest possible moments of inertia",
 } | dict.fromkeys(DRIVES, "or name the driven joints under robot.actuators")
 """What the name of a lost part contains -> what to do besides."""
+
+_ROLL_PITCH_YAW = (
+    "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place of a "
+    "quaternion, whose length no force keeps at 1, and must not pitch by 90 degrees"
+)
 
 _RED = [0.8, 0.1, 0.1, 1.0]
 
@@ -63,7 +98,7 @@ def robot_links(
     robot: Robot, scene_graph: SceneGraph, payloads: Sequence[Payload] = (), drawn: bool = True
 ) -> RobotLinks:
     """The links of a scenario's robot, and its loop-closing joints as constraints."""
-    plant, cuts = read_robot(robot, None, scene_graph, payloads, drawn)
+    plant, loops = read_robot(robot, None, scene_graph, payloads, drawn)
     finalize(plant)
     for joint in joints_of(plant):
         if isinstance(joint, QuaternionFloatingJoint):
@@ -75,19 +110,12 @@ def robot_links(
             )
     links = MultibodyExpressions(plant, scene_graph)
     _check_mass(plant)
-    try:
-        plant_constraints(links)
-    except ModelError as error:
-        raise ModelError(
-            f"{error}. robot.leave_out takes them out, as [equality/connect] of MJCF, or "
-            "[robot/drake:ball_constraint] of a URDF"
-        ) from None
-    return links, [loop_constraint(cut, plant) for cut in cuts]
+    return links, [make(plant) for make in loops.values()]
 
 
 def finalize(plant: MultibodyPlant) -> None:
     """Finalizes a plant."""
-    with drake_errors():
+    with _drake():
         plant.Finalize()
 
 
@@ -112,156 +140,120 @@ def _check_mass(plant: MultibodyPlant) -> None:
         )
 
 
+# From files to a plant.
+
+
 def read_robot(
     robot: Robot,
     plant: MultibodyPlant | None = None,
     scene_graph: SceneGraph | None = None,
     payloads: Sequence[Payload] = (),
     drawn: bool = True,
-) -> tuple[MultibodyPlant, list[CutJoint]]:
-    """Reads a robot into a plant that is not finalized, with the changes of the scenario.
-
-    Joints that close loops are cut.
-    """
+) -> tuple[MultibodyPlant, LoopMakers]:
+    """Reads a robot into a plant that is not finalized, with the changes of the scenario."""
     if plant is None:
         plant = MultibodyPlant(0.0)  # In continuous time, as (37).
         if scene_graph is not None:
             plant.RegisterAsSourceForSceneGraph(scene_graph)
-    shapes = ["read", *["drawn"] * drawn] if scene_graph is not None else []
     parser = Parser(plant)
-    files = RobotFiles(robot, parser.package_map())
     with TemporaryDirectory() as folder:
-        mender = Mender(files, robot, Path(folder).resolve(), shapes)
-        with drake_errors(mender.originals):
-            models = _mended(robot, files, mender)
+        files, own = RobotFiles(robot, parser.package_map()), Path(folder).resolve()
+        mender = Mender(files, robot, own, scene_graph is not None, drawn)
+        with _drake(mender):
+            models = _mended(mender)
             if mender.lost:
                 raise ModelError(_told(mender.lost))
-            with _remarks(mender):
-                if isinstance(models, Path):
-                    parser.AddModels(str(models))
-                else:
-                    ProcessModelDirectives(models, parser)
-            _add_floating_joints(plant, mender)
-    for (category, kind), items in mender.told.items():
-        warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
-    for model, name in sorted(mender.crossed):
-        body = plant.GetBodyByName(name, *_instance(plant, model)) if name else plant.world_body()
-        for axis in range(3):
-            bar = Box(*np.where(np.arange(3) == axis, 0.06, 0.004))
-            plant.RegisterVisualGeometry(body, RigidTransform(), bar, f"left_out_{axis}", _RED)
-    with drake_errors():
-        _free_limits(robot, plant)
-        change_robot(robot, plant, mender.joints)
+            if isinstance(models, Path):
+                parser.AddModels(str(models))
+            else:
+                ProcessModelDirectives(models, parser)
+    with _drake():
+        for model, name in sorted(mender.crossed):
+            body = frame_named(plant, _scoped(model, name or "world")).body()
+            for axis in range(3):
+                bar = Box(*np.where(np.arange(3) == axis, 0.06, 0.004))
+                plant.RegisterVisualGeometry(body, RigidTransform(), bar, f"left_out_{axis}", _RED)
+        for model, name, child, origin in mender.floating:
+            link = frame_named(plant, _scoped(model, child))
+            start = plant.GetDefaultFloatingBaseBodyPose(link.body())
+            joint = RpyFloatingJoint(name, frame_named(plant, _scoped(model, origin)), link)
+            plant.AddJoint(joint).SetDefaultPose(start)
+            mender.tell(_ROLL_PITCH_YAW, f"'{name}'")
+        for (category, kind), items in mender.told.items():
+            warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
+        facts = dict[JointIndex, Mapping[str, Any]]()
+        for joint in joints_of(plant):
+            name, model = joint.name(), plant.GetModelInstanceName(joint.model_instance())
+            facts[joint.index()] = mender.joints.get(("", name)) or mender.joints[model, name]
+        _change(plant, robot, facts)
         add_payloads("plant.payloads", payloads, plant)
-        return plant, cut_loops(plant, mender.joints["parent"])
+        return plant, _cut_loops(plant, facts)
 
 
 def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
     """The packages that a robot's file names and that are not found, and what is lost of it."""
     files = RobotFiles(robot, Parser(MultibodyPlant(0.0)).package_map())
-    mender = Mender(files, robot, None, ["read"])
-    with drake_errors():
-        _mended(robot, files, mender)
+    mender = Mender(files, robot, None, has_geometry=True, drawn=False)
+    with _drake():
+        _mended(mender)
     return list(files.missing), list(mender.lost)
 
 
-def _mended(robot: Robot, files: RobotFiles, mender: Mender) -> Path | ModelDirectives:
+def _mended(mender: Mender) -> Path | ModelDirectives:
     """The mended copy of the robot's file, or directives with the copies of their models."""
-    placed = [*([robot.base.weld] if robot.base is not None else []), *robot.free]
+    files = mender.files
     if not files.main.name.endswith((".dmd.yaml", ".dmd.yml")):
-        return mender.copy(files.main, "", placed)
-    _find_packages(files, files.main, ())
+        return mender.copy(files.main)
+    _find_packages(files, files.main)
     directives = FlattenModelDirectives(LoadModelDirectives(str(files.main)), files.packages)
     welds = (directive.add_weld for directive in directives.directives)
-    placed += [weld.child for weld in welds if weld is not None]
+    placed = mender.placed | {weld.child for weld in welds if weld is not None}
     for directive in directives.directives:
         if (model := directive.add_model) is not None:
-            links = [link.removeprefix(f"{model.name}::") for link in placed]
-            file = files.needed(model.file, files.main)
-            model.file = mender.copy(file, model.name, links).as_uri()
+            mender.placed = {link.removeprefix(f"{model.name}::") for link in placed}
+            model.file = mender.copy(files.needed(model.file, files.main), model.name).as_uri()
     return directives
 
 
-def _find_packages(files: RobotFiles, file: Path, within: tuple[Path, ...]) -> None:
+def _find_packages(files: RobotFiles, file: Path) -> None:
     """Finds the packages of directives that others include."""
-    check_included(file, within)
-    for directive in LoadModelDirectives(str(file)).directives:
-        if directive.add_directives is not None:
-            inner = files.needed(directive.add_directives.file, file)
-            _find_packages(files, inner, (*within, file.resolve()))
+    with files.within(file):
+        for directive in LoadModelDirectives(str(file)).directives:
+            if directive.add_directives is not None:
+                _find_packages(files, files.needed(directive.add_directives.file, file))
 
 
-def _free_limits(robot: Robot, plant: MultibodyPlant) -> None:
-    """Takes away limits that leave no room: speeds of 0, and positions if the scenario says so."""
-    unlimited = np.full(1, np.inf)  # Many authors write 0 for an unknown limit.
-    for joint in joints_of(plant):
-        if joint.num_positions() == 1:
-            low, high = joint.position_lower_limits(), joint.position_upper_limits()
-            if "empty_limits" in robot.leave_out and low == high:
-                joint.set_position_limits(-unlimited, unlimited)
-            if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
-                joint.set_velocity_limits(-unlimited, unlimited)
-
-
-def _add_floating_joints(plant: MultibodyPlant, mender: Mender) -> None:
-    """Adds floating joints in roll, pitch and yaw: Drake has a quaternion in their place.
-
-    No constraint force keeps the length of a quaternion at 1.
-    """
-    kind = (
-        "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place of "
-        "a quaternion, and must not pitch by 90 degrees"
-    )
-    for model, name, child, origin in mender.floating:
-        models, is_world = _instance(plant, model), origin == "world"
-        body = plant.GetBodyByName(child, *models)
-        start = plant.GetDefaultFloatingBaseBodyPose(body)
-        frame = plant.world_frame() if is_world else plant.GetFrameByName(origin, *models)
-        joint = plant.AddJoint(RpyFloatingJoint(name, frame, body.body_frame()))
-        if is_world:
-            joint.SetDefaultPose(start)
-        mender.tell(kind, f"'{name}'")
-
-
-def _instance(plant: MultibodyPlant, model: str) -> list[ModelInstanceIndex]:
-    return [plant.GetModelInstanceByName(model)] if model else []
+def _scoped(model: str, name: str) -> str:
+    return f"{model}::{name}" if model and name != "world" else name
 
 
 @contextmanager
-def drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Iterator[None]:
-    """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
+def _drake(mender: Mender | None = None) -> Iterator[None]:
+    """Makes ModelErrors of Drake's errors, also of failed assertions, and tells what it logs."""
+    here, logger = get_native_id(), logging.getLogger("drake")
+
+    def text_of(message: object) -> str:
+        text = str(message)  # The names of copies become those of their files.
+        for copy, file in mender.originals.items() if mender is not None else ():
+            text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
+        return " ".join(text.split())
+
+    def passes(record: logging.LogRecord) -> bool:
+        if mender is None or record.thread != here or record.levelno < logging.WARNING:
+            return True
+        text = text_of(record.getMessage()).replace(" warning:", "")
+        mender.tell("Drake reads the file with remarks", text[:200])
+        return False
+
+    logger.addFilter(passes)
     try:
         yield
     except DrakeDaeError:
         raise
     except (RuntimeError, ValueError, SystemExit) as error:
-        raise ModelError(_of_originals(str(error), originals)) from None
-
-
-@contextmanager
-def _remarks(mender: Mender) -> Iterator[None]:
-    """Tells what Drake logs in this thread."""
-    here, logger = get_native_id(), logging.getLogger("drake")
-
-    def passes(record: logging.LogRecord) -> bool:
-        is_remark = record.thread == here and record.levelno >= logging.WARNING
-        if is_remark:
-            text = _of_originals(record.getMessage(), mender.originals).replace(" warning:", "")
-            mender.tell("Drake reads the file with remarks", text[:200])
-        return not is_remark
-
-    logger.addFilter(passes)
-    try:
-        yield
+        raise ModelError(text_of(error)) from None
     finally:
         logger.removeFilter(passes)
-
-
-def _of_originals(text: str, originals: Mapping[Path, Path]) -> str:
-    """A text of Drake with the names of files in the place of those of their copies."""
-    for copy, file in originals.items():
-        text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
-    return " ".join(text.split())
 
 
 def _told(lost: Mapping[str, list[str]]) -> str:
@@ -275,7 +267,300 @@ def _told(lost: Mapping[str, list[str]]) -> str:
     )
 
 
-def _listed(items: Iterable[str], most: int = 8) -> str:
+def _listed(items: Iterable[str]) -> str:
     every = list(dict.fromkeys(items))
-    more = f" and {len(every) - most} more" if len(every) > most else ""
-    return ", ".join(every[:most]) + more
+    return ", ".join(every[:8]) + (f" and {len(every) - 8} more" if len(every) > 8 else "")
+
+
+# What a scenario changes.
+
+
+def joints_of(plant: MultibodyPlant) -> list[Joint]:
+    """The joints of a plant."""
+    return [plant.get_joint(index) for index in plant.GetJointIndices()]
+
+
+def _actuators_of(plant: MultibodyPlant) -> list[JointActuator]:
+    return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+
+
+def _is_simple(joint: Joint) -> bool:
+    return isinstance(joint, RevoluteJoint | PrismaticJoint)
+
+
+def _simple_joint(name: str, plant: MultibodyPlant) -> Joint:
+    joints = {own: joint for own, joint in joint_names(plant).items() if _is_simple(joint)}
+    if name not in joints:
+        raise ModelError(unknown_name("turning or sliding joint", name, joints))
+    return joints[name]
+
+
+def _change(plant: MultibodyPlant, robot: Robot, facts: _Facts) -> None:
+    """Applies the changes that a scenario makes to the robot of its file."""
+    leaders = dict[JointIndex, tuple[JointIndex, float, float]]()
+    follows = {index: of["follows"] for index, of in facts.items() if "follows" in of}
+    for index, (name, ratio, offset) in follows.items():
+        joint = plant.get_joint(index)
+        model = joint.model_instance()
+        if name == joint.name() or not plant.HasJointNamed(name, model):
+            text = f"joint '{joint.name()}' mimics '{name}', which is no other joint of its file"
+            raise ModelError(text)
+        leaders[index] = plant.GetJointByName(name, model).index(), ratio, offset
+    if robot.base is not None:
+        with at("robot.base.weld"):
+            frame, pose = _unattached(robot.base.weld, plant), robot.base.pose
+            rotation = RollPitchYaw(np.deg2rad(pose.rpy_deg))
+            plant.WeldFrames(plant.world_frame(), frame, RigidTransform(rotation, pose.translation))
+    locked = _lock_joints(robot.locked, plant, leaders)
+    for index, (leader, ratio, offset) in leaders.items():
+        if index not in locked:
+            pair = plant.get_joint(index), plant.get_joint(leader)
+            plant.AddCouplerConstraint(*pair, ratio, offset)
+    with at("robot.free"):
+        for name in robot.free:
+            body = _unattached(name, plant).body()
+            plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
+    if robot.actuators is not None:
+        _drive_joints(robot.actuators, plant, leaders, facts)
+    add_payloads("robot.payloads", robot.payloads, plant)
+
+    driven = {actuator.joint().index() for actuator in _actuators_of(plant)}
+    for name, joint in joint_names(plant).items():
+        armature = facts.get(joint.index(), {}).get("armature")
+        if armature and joint.index() not in driven and ARMATURE not in robot.leave_out:
+            raise ModelError(
+                f"joint '{name}' has an armature of {armature:g} and no motor, and Drake gives "
+                "only motors one; name it under robot.actuators, or write leave_out: "
+                "[joint/armature] under robot"
+            )
+
+
+def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -> None:
+    """Adds the payloads of a key of the scenario to a plant that is not finalized."""
+    for index, payload in enumerate(payloads):
+        with at(f"{key}.{index}"):
+            frame = frame_named(plant, payload.frame)
+            if frame.body() == plant.world_body():
+                raise ModelError(f"a payload on '{payload.frame}', of the world, moves nothing")
+            if plant.HasBodyNamed(payload.name):
+                raise ModelError(f"a body '{payload.name}' is there; give the payload another name")
+            inertia = SpatialInertia(payload.mass, [0.0, 0.0, 0.0], UnitInertia(0.0, 0.0, 0.0))
+            body = plant.AddRigidBody(payload.name, frame.model_instance(), inertia)
+            plant.WeldFrames(frame, body.body_frame(), RigidTransform(list(payload.point)))
+
+
+def _unattached(name: str, plant: MultibodyPlant) -> Frame:
+    """A frame of a body without a joint to a parent."""
+    frame = frame_named(plant, name)
+    if frame.body() == plant.world_body():
+        raise ModelError("the world is no part of the robot; name a frame of the robot")
+    holding = {joint.child_body().index(): joint.name() for joint in reversed(joints_of(plant))}
+    if frame.body().index() in holding:
+        bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+        free = [body.name() for body in bodies if body.index() not in holding]
+        raise ModelError(
+            f"'{name}' is attached already, by joint '{holding[frame.body().index()]}'; unattached "
+            f"bodies: {', '.join(free) or 'none'}"
+        )
+    return frame
+
+
+@at("robot.locked")
+def _lock_joints(
+    locked: Mapping[str, float], plant: MultibodyPlant, leaders: _Leaders
+) -> Container[JointIndex]:
+    """Replaces joints, and those that follow them, by welds with their constant X_FM(q).
+
+    Drake supports locked joints only in discrete time. Actuator, damping and rotor go.
+    """
+    names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    positions = {index: offset for index, (_, ratio, offset) in leaders.items() if ratio == 0.0}
+    positions |= {_simple_joint(name, plant).index(): value for name, value in locked.items()}
+    for _ in leaders:  # As often as the longest chain needs.
+        for follower, (leader, ratio, offset) in leaders.items():
+            if leader in positions and ratio != 0.0:
+                coupled = ratio * positions[leader] + offset
+                if abs(positions.setdefault(follower, coupled) - coupled) > 1e-9:
+                    raise ModelError(
+                        f"'{names[follower]}' follows '{names[leader]}', which makes it "
+                        f"{coupled:g}, and not {positions[follower]:g}; lock one of them"
+                    )
+            elif follower in positions and ratio != 0.0:
+                positions[leader] = (positions[follower] - offset) / ratio
+    welds = list[WeldJoint]()
+    for index, value in positions.items():
+        name = names[index]
+        joint = _simple_joint(name, plant)
+        low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        slides = isinstance(joint, PrismaticJoint)
+        if not low - 1e-9 <= value <= high + 1e-9:  # Round-off of a ratio puts nothing outside.
+            unit = "m" if slides else "rad"
+            why = "" if name in locked else ", as the joint that it is coupled to has it,"
+            raise ModelError(
+                f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
+            )
+        if slides:
+            pose = RigidTransform(value * joint.translation_axis())
+        else:
+            pose = RigidTransform(AngleAxis(value, joint.revolute_axis()), np.zeros(3))
+        frames = joint.frame_on_parent(), joint.frame_on_child()
+        welds.append(WeldJoint(joint.name(), *frames, pose))
+        # Python's joint must be gone before Drake's: a new one at its address is taken for it.
+        del joint
+        _remove_joint(index, plant, f"'{name}' cannot be locked")
+    for weld in welds:
+        plant.AddJoint(weld)
+    return positions
+
+
+def _remove_joint(index: JointIndex, plant: MultibodyPlant, consequence: str) -> None:
+    """Removes a joint and its motor."""
+    for actuator in _actuators_of(plant):
+        if actuator.joint().index() == index:
+            plant.RemoveJointActuator(actuator)
+    try:
+        plant.RemoveJoint(plant.get_joint(index))
+    except RuntimeError as error:
+        raise ModelError(
+            f"{consequence}: {error} Springs and constraints of the file stop it: robot.leave_out "
+            "takes them out, as [dynamics/spring_stiffness] or [equality/connect]"
+        ) from None
+
+
+@at("robot.actuators")
+def _drive_joints(
+    driven: str | Sequence[str] | Mapping[str, float | None],
+    plant: MultibodyPlant,
+    followers: Container[JointIndex],
+    facts: _Facts,
+) -> None:
+    """Adds actuators to the joints that a scenario names, and removes those of all other joints.
+
+    Actuators of the file remain, with their gear ratios and rotors.
+    """
+    if driven == "all":
+        driven = [
+            name
+            for name, joint in joint_names(plant).items()
+            if _is_simple(joint) and joint.index() not in followers
+        ]
+    limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
+    names = {_simple_joint(name, plant).index(): name for name in limits}
+    for actuator in _actuators_of(plant):
+        name = names.pop(actuator.joint().index(), None)
+        if name is None:
+            plant.RemoveJointActuator(actuator)
+        elif (limit := limits[name]) is not None:
+            actuator.set_effort_limit(limit)
+    for index, name in names.items():
+        joint, known = plant.get_joint(index), facts.get(index, {})
+        effort = known.get("effort") or np.inf if limits[name] is None else limits[name]
+        actuator = plant.AddJointActuator(joint.name(), joint, effort)
+        actuator.set_default_rotor_inertia(known.get("armature", 0.0))
+
+
+# Loops.
+
+
+def _cut_loops(plant: MultibodyPlant, facts: _Facts) -> LoopMakers:
+    """Removes joints until the others form a tree; driven joints only if necessary."""
+    driven = {actuator.joint().index() for actuator in _actuators_of(plant)}
+    names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    groups, loops = list(range(plant.num_bodies())), LoopMakers()
+    for joint in sorted(
+        joints_of(plant),
+        key=lambda joint: (not _is_simple(joint), joint.index() in driven),
+        reverse=True,
+    ):
+        ends = joint.parent_body(), joint.child_body()
+        first, second = (groups[int(body.index())] for body in ends)
+        if first == second:
+            name = names.get(joint.index(), joint.name())
+            loops[name] = _cut(joint, name, plant, facts.get(joint.index(), {}).get("parent", ""))
+        groups = [second if group == first else group for group in groups]
+    return loops
+
+
+def _cut(
+    joint: Joint, name: str, plant: MultibodyPlant, parent_frame: str
+) -> Callable[[MultibodyPlant], Constraint]:
+    if not _is_simple(joint):
+        raise ModelError(
+            f"joint '{name}' closes a loop, and neither turns nor slides; take it out of the file, "
+            "and write it under constraints, as a !WeldedFrames or !CoincidentPoints"
+        )
+    frames = joint.frame_on_parent(), joint.frame_on_child()
+    poses = [frame.GetFixedPoseInBodyFrame() for frame in frames]
+    # A joint of SDFormat is at its child; of a frame that is its parent, only the body counts.
+    if parent_frame and plant.HasFrameNamed(parent_frame, joint.model_instance()):
+        frame = plant.GetFrameByName(parent_frame, joint.model_instance())
+        gap = frame.GetFixedPoseInBodyFrame().translation() - poses[0].translation()
+        if frame.name() != frame.body().name() and np.linalg.norm(gap) > 1e-6:
+            raise ModelError(
+                f"joint '{name}' closes a loop at its child, {np.linalg.norm(gap):.3g} m from the "
+                f"frame '{parent_frame}' that it names as its parent: of that only the body "
+                f"'{frame.body().name()}' counts. Let <pose> place the joint at the frame"
+            )
+    limits = {
+        "lower": joint.position_lower_limits()[0],
+        "upper": joint.position_upper_limits()[0],
+        "velocity_limit": joint.velocity_upper_limits()[0],
+    }
+    options: dict[str, Any] = {"damping": joint.default_damping(), "name": name}
+    for actuator in _actuators_of(plant):
+        if actuator.joint().index() == joint.index():
+            if actuator.default_rotor_inertia() != 0.0:
+                raise ModelError(
+                    f"joint '{name}' closes a loop, as all joints of it do that could be cut, and "
+                    "its motor has a rotor: that cannot be a constraint; leave one joint without "
+                    "motor"
+                )
+            options["motor"], limits["effort_limit"] = True, actuator.effort_limit()
+    options |= {key: float(value) for key, value in limits.items() if isfinite(value)}
+    slides = isinstance(joint, PrismaticJoint)
+    axis = np.array(joint.translation_axis() if slides else joint.revolute_axis())
+    bodies = [frame.body().index() for frame in frames]
+    _remove_joint(joint.index(), plant, f"joint '{name}' closes a loop, and cannot be cut")
+    return partial(_loop_constraint, slides, bodies, poses, axis, options)
+
+
+def _loop_constraint(
+    slides: bool,
+    indices: Sequence[BodyIndex],
+    poses: Sequence[RigidTransform],
+    axis: FloatArray,
+    options: Mapping[str, Any],
+    plant: MultibodyPlant,
+) -> Constraint:
+    """The constraint that replaces a cut joint; planar where the loop is, or it were redundant."""
+    bodies, context = [plant.get_body(index) for index in indices], plant.CreateDefaultContext()
+    rotation = plant.EvalBodyPoseInWorld(context, bodies[0]).rotation() @ poses[0].rotation()
+    # The columns of the rate of the child in the parent: of joints that turn, and that slide.
+    rates = plant.CalcJacobianSpatialVelocity(
+        context,
+        JacobianWrtVariable.kV,
+        bodies[1].body_frame(),
+        np.zeros((3, 1)),
+        bodies[0].body_frame(),
+        plant.world_frame(),
+    )
+    turning = [column for column in rates[:3].T if np.linalg.norm(column) > 1e-9]
+    sliding = [*rates[3:].T]
+    (sliding if slides else turning).append(rotation @ axis)
+    normal = turning[-1] if turning else np.zeros(3)
+    leans = [np.linalg.norm(np.cross(normal, other)) for other in turning]
+    leans += [abs(normal @ other) for other in sliding]
+    is_planar = bool(turning) and bool(max(leans) <= 1e-9)
+    axes = axes_along(axis)
+    if slides and is_planar:
+        across = rotation.inverse() @ normal
+        axes = np.column_stack([across, np.cross(axis, across), axis])
+    own = dict(options)
+    for letter, body, pose in zip("ab", bodies, poses, strict=True):
+        frame = pose @ RigidTransform(RotationMatrix(axes), np.zeros(3))
+        own[f"frame_{letter}"] = frame_name(plant, body.body_frame())
+        own[f"point_{letter}"] = triple("a point", frame.translation())
+        own[f"rpy_{letter}"] = triple("an angle", RollPitchYaw(frame.rotation()).vector())
+    if slides:
+        return PrismaticLoopJoint(axis="z", normal="x" if is_planar else None, **own)
+    return RevoluteLoopJoint(axis="z", planar=is_planar, **own)

@@ -7,7 +7,7 @@ from pydrake.geometry import Role, SceneGraph
 from vendors import write_panda
 
 from drake_dae import load_scenario
-from drake_dae.errors import GeometryWarning, ScenarioError
+from drake_dae.errors import GeometryWarning, RobotFileWarning, ScenarioError
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
@@ -69,7 +69,8 @@ def test_a_package_beside_that_of_the_file_is_found(tmp_path: Path):
 def test_a_package_in_ros_package_path_is_found(tmp_path: Path, monkeypatch):
     file = away(tmp_path)
     monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path}/none:{tmp_path}/workspace")
-    assert joints(tmp_path, file) == 7
+    with pytest.warns(RobotFileWarning, match=f"{tmp_path}/none"):  # It is no folder.
+        assert joints(tmp_path, file) == 7
 
 
 def test_directives_name_packages_by_files_in_packages(tmp_path: Path, monkeypatch):

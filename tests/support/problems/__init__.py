@@ -12,6 +12,7 @@ from problems.hidden import Hidden, hidden_normal_form
 from problems.made_up import (
     bead,
     changed,
+    circuit,
     double_integrator,
     early_control,
     held_point,
@@ -31,7 +32,6 @@ from problems.mechanisms import (
     pendulum_tension,
     two_link_arm,
 )
-from problems.networks import circuit, swing_network
 from problems.nonholonomic import knife_edge, knife_edge_force, rolling_disk
 from problems.problem import Array, Known, Problem, known, unconstrained
 
@@ -76,7 +76,6 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
         knife_edge,
         knife_edge_force,
         rolling_disk,
-        swing_network,
         aircraft,
         gantry,
         held_point,

@@ -46,37 +46,6 @@ def vtol() -> DaeSystem:
     )
 
 
-def quadrotor() -> DaeSystem:
-    """A quadrotor of four thrusts, with z = (position, yaw)."""
-
-    def thrust_axis(a: ca.SX) -> list[ca.SX]:
-        roll, pitch, yaw = a[0], a[1], a[2]
-        forward, side = ca.sin(pitch) * ca.cos(roll), ca.sin(roll)
-        return [
-            ca.cos(yaw) * forward + ca.sin(yaw) * side,
-            ca.sin(yaw) * forward - ca.cos(yaw) * side,
-            ca.cos(pitch) * ca.cos(roll),
-        ]
-
-    def f(x: ca.SX) -> list:
-        roll, pitch, (p, q, r) = x[3], x[4], ca.vertsplit(x[9:])
-        turn = ca.sin(roll) * q + ca.cos(roll) * r
-        angles = [p + ca.tan(pitch) * turn, ca.cos(roll) * q - ca.sin(roll) * r]
-        rates = [-0.6 * q * r, 0.5 * p * r, 0.1 * p * q]
-        return [*ca.vertsplit(x[6:9]), *angles, turn / ca.cos(pitch), 0, 0, -GRAVITY, *rates]
-
-    arms = [[0, 5, 0, -5], [-5, 0, 5, 0], [0.4, -0.4, 0.4, -0.4]]
-    return DaeSystem.from_functions(
-        ["x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "p", "q", "r"],
-        f=f,
-        h=lambda x: [*[[0] * 4] * 6, *[[axis] * 4 for axis in thrust_axis(x[3:6])], *arms],
-        l=lambda x: [x[0], x[1], x[2], x[5]],
-        control_signals=["front", "left", "back", "right"],
-        output_signals=["x", "y", "z", "yaw"],
-        name="quadrotor",
-    )
-
-
 CRANE = np.array([3.0, 0.5, 1.0])
 """Masses of the trolley, of the winch and of the load, in kg."""
 
@@ -130,12 +99,6 @@ REGULAR = {
     "unicycle": (unicycle, {"v": 0.8}, {"v": 1}, (2, 2)),
     "wheels": (wheels, {"left": 1.0, "right": 2.0}, {"left": 1}, (2, 2)),
     "vtol": (vtol, {"thrust": GRAVITY}, {"thrust": 2}, (4, 4)),
-    "quadrotor": (
-        quadrotor,
-        dict.fromkeys(("front", "left", "back", "right"), GRAVITY / 4),
-        {"front": 2},
-        (4, 4, 4, 2),
-    ),
     "crane": (crane, {"winch": -GRAVITY}, {"winch": 2}, (4, 4)),
     "sleigh": (sleigh, {}, {"u0": 1}, (3, 3)),
 }

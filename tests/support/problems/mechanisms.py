@@ -268,7 +268,6 @@ def aircraft() -> Problem:
         reference=[(0.0, 0.0, 0.2), (0.0, 0.0, 0.2)],
         horizon=1.0,  # Its zero dynamics are not stable.
         source="Hauser, Sastry and Meyer, Automatica 28(4), 1992",
-        minimum_phase=False,
     )
 
 

@@ -38,8 +38,6 @@ class Problem:
         derivatives: x -> k and its derivatives, constraint-major, shape (sum r_i,).
         horizon: How long it can be followed, in s.
         source: Where degrees or index are published; "" if made up for the tests.
-        minimum_phase: Whether the zero dynamics are exponentially stable at the equilibrium next to
-            the nominal state; None if they are trivial, or have no such equilibrium.
     """
 
     system: DaeSystem
@@ -54,7 +52,6 @@ class Problem:
     derivatives: Callable[[Array], Array] = field(default=lambda x: np.zeros(0))
     horizon: float = 1.5
     source: str = ""
-    minimum_phase: bool | None = None
 
     @cached_property
     def structure(self) -> Structure:

@@ -1,7 +1,8 @@
 """The run of a diagram in which all traced blocks are one, by Drake's Simulator."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Container, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -17,38 +18,52 @@ from pydrake.systems.framework import (
     Diagram,
     DiagramBuilder,
     EventStatus,
+    OutputPort,
     PortDataType,
     System,
 )
 from pydrake.systems.primitives import VectorLogSink
 
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.compose import Leaves, compose
+from drake_dae.blocks.block import stacked
+from drake_dae.blocks.compose import Composed, Leaves, Port, compose, leaf_port
 from drake_dae.blocks.primitives import symbolic_block
-from drake_dae.blocks.traced_system import TracedSystem
+from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.errors import DrakeDaeError
 from drake_dae.systems.plant import plants_in
+from drake_dae.trace.compiled import Compiled
 
 EVERY = 32  # The number of steps after which the context of the diagram as wired gets the results.
 # The least number of steps for which composing the diagram takes less time than it saves.
 WORTH = 500
 USUAL = 0.02  # The usual step with error control in s, of a robot that moves through some radians.
+ROW = "$row"  # The output with the values of `MergedRun.row`.
 NEAR = 1e-6  # The distance of another state at which ports are compared, in any unit.
 # The initialization of a Simulator that goes on from a context.
 NO_EVENTS = InitializeParams(suppress_initialization_events=True)
 
 
-class CompiledRun:
+class MergedRun:
     """A diagram in which one block has the place of all that can be traced, beside the rest.
 
-    The rest, such as Drake's MultibodyPlant and sources of random numbers, are copies. States, logs
+    The rest, such as Drake's MultibodyPlant and sources of random numbers, are copies; of these
+    only what leads to some `ports` if these are given, whose values are then a `row`. States, logs
     and time of the diagram as wired follow after every few steps; `steps` counts these.
     """
 
-    def __init__(self, diagram: Diagram, context: Context, config: SimulatorConfig) -> None:
-        self._context, self.steps, leaves = context, 0, Leaves.of(diagram)
-        logs = [s for s in leaves.systems if isinstance(s, VectorLogSink)]
-        rest = logs + [s for s in leaves.systems if s not in logs and not _is_traced(s)]
+    def __init__(
+        self,
+        diagram: Diagram,
+        context: Context,
+        ports: Mapping[str, OutputPort] | None = None,
+        compiled: Compiled | None = None,
+    ) -> None:
+        leaves = self._leaves = Leaves.of(diagram)
+        needed = set(leaves.systems)
+        if ports is not None:
+            needed = upstream(leaves, map(leaf_port, ports.values()))
+        sinks = [s for s in leaves.systems if s in needed and isinstance(s, VectorLogSink)]
+        rest = sinks + [s for s in leaves.systems if s in needed and not _is_traced(s)]
         outputs = {
             f"{system.get_name()}.{system.get_input_port(i).get_name()}": (system, i)
             for system in rest
@@ -56,46 +71,73 @@ class CompiledRun:
             if (system, i) in leaves.sources and _is_traced(leaves.sources[system, i][0])
         }
         sources = {name: leaves.sources[place] for name, place in outputs.items()}
-        ports = {name: system.get_output_port(i) for name, (system, i) in sources.items()}
+        wanted = {name: system.get_output_port(i) for name, (system, i) in sources.items()}
+        wanted |= {f"${name}": port for name, port in (ports or {}).items()}
+        # Runs with ports have other numbers each.
         self.composed = composed = compose(
-            diagram, ports, context=context, merge=True, is_whole=True
+            diagram, wanted, context=context, merge=True, is_whole=True, shares=ports is None
         )
-        (choice, *_) = [p.dae.compiled for p in plants_in(diagram)]
+        values = {name: composed.block.outputs[name] for name in outputs}
+        row = [value for name, value in composed.block.outputs.items() if name not in outputs]
+        block = replace(composed.block, outputs=values | ({ROW: stacked(row)} if row else {}))
+        choice = plants_in(diagram)[0].dae.compiled if compiled is None else compiled
         builder = DiagramBuilder()
-        self._block = block = builder.AddSystem(TracedSystem(composed.block, compiled=choice))
-        self._copies = copies = {system: builder.AddSystem(_copy(system)) for system in rest}
+        self._block = one = builder.AddSystem(TracedSystem(block, compiled=choice))
+        self._copies = copies = dict[System, System]()
+        for system in rest:  # Systems of ours say how they are copied.
+            again = getattr(system, "again", system.Clone)
+            copies[system] = builder.AddNamedSystem(system.get_name(), again())
         for (system, i), (source, k) in leaves.sources.items():
             if system in copies and source in copies:
                 written = copies[source].get_output_port(k)
                 builder.Connect(written, copies[system].get_input_port(i))
         for name, (system, i) in outputs.items():
-            builder.Connect(block.GetOutputPort(name), copies[system].get_input_port(i))
+            builder.Connect(one.GetOutputPort(name), copies[system].get_input_port(i))
         for name, (source, k) in composed.cuts.items():
-            builder.Connect(copies[source].get_output_port(k), block.GetInputPort(name))
+            builder.Connect(copies[source].get_output_port(k), one.GetInputPort(name))
         self._diagram = builder.Build()
-        self._own = own = self._diagram.CreateDefaultContext()
+        self._own = self._diagram.CreateDefaultContext()
+        self._simulator = Simulator(self._diagram, self._own)
+
+    def begin(self, context: Context, config: SimulatorConfig) -> None:
+        """Takes time, states, parameters and fixed values from a context of the diagram."""
+        own, one, composed = self._own, self._block, self.composed
+        self._context, self.steps = context, 0
         own.SetTime(context.get_time())
-        for system in rest[len(logs) :]:
-            copy, at_system = copies[system], system.GetMyContextFromRoot(context)
-            local = copy.GetMyMutableContextFromRoot(own)
+        for system, copy in self._copies.items():
+            at_system, local = context_in(system, context), copy.GetMyMutableContextFromRoot(own)
+            if isinstance(system, VectorLogSink):
+                continue
             local.SetStateAndParametersFrom(at_system)
-            for i in range(system.num_input_ports()):  # Those with a fixed value.
+            for i in range(system.num_input_ports()):
                 port = system.get_input_port(i)
                 is_vector = port.get_data_type() == PortDataType.kVectorValued
-                if (system, i) not in leaves.sources and is_vector and port.HasValue(at_system):
+                is_wired = (system, i) in self._leaves.sources
+                if not is_wired and is_vector and port.HasValue(at_system):
                     copy.get_input_port(i).FixValue(local, port.Eval(at_system))
-        at_block = block.GetMyMutableContextFromRoot(own)
+        at_block, x = one.GetMyMutableContextFromRoot(own), np.zeros(composed.block.state.numel())
+        for system, part in composed.states.items():
+            x[part] = context_in(system, context).get_continuous_state_vector().CopyToVector()
+        at_block.SetContinuousState(x)
+        for (system, i), (group, part) in composed.held.items():
+            index = [*composed.block.held].index(group)
+            held = at_block.get_discrete_state(index).CopyToVector()
+            held[part] = context_in(system, context).get_discrete_state(i).CopyToVector()
+            at_block.SetDiscreteState(index, held)
+        values = parameters_in(composed, context)
+        if values.size:
+            at_block.get_mutable_numeric_parameter(0).SetFromVector(values)
         for name, (system, i) in composed.fixed.items():
-            port, local = system.get_input_port(i), system.GetMyContextFromRoot(context)
+            port, local = system.get_input_port(i), context_in(system, context)
             if port.HasValue(local):
-                block.GetInputPort(name).FixValue(at_block, port.Eval(local))
-        self._simulator = Simulator(self._diagram, own)
+                one.GetInputPort(name).FixValue(at_block, port.Eval(local))
         ApplySimulatorConfig(config, self._simulator)
         own.SetAccuracy(config.accuracy)
         self._simulator.Initialize(NO_EVENTS)
-        block.begin_run(at_block)
-        for log in logs:  # The log as wired has the start already.
-            copies[log].FindMutableLog(own).Clear()
+        one.begin_run(at_block)
+        for system, copy in self._copies.items():
+            if isinstance(system, VectorLogSink):  # The log as wired has the start already.
+                copy.FindMutableLog(own).Clear()
 
     @classmethod
     def of(
@@ -112,7 +154,8 @@ class CompiledRun:
         if not plants or duration < WORTH * step:
             return None
         with suppress(DrakeDaeError, RuntimeError):
-            run = cls(diagram, context, config)
+            run = cls(diagram, context)
+            run.begin(context, config)
             return run if _is_by_wires(diagram, context) else None
         return None
 
@@ -128,7 +171,7 @@ class CompiledRun:
             last = now
             if count < EVERY:
                 return _GOES_ON
-            self._write_back(count)
+            self.write_back(count)
             try:
                 goes_on, count = seen(self._context, count), 0
             except DrakeDaeError as error:
@@ -141,7 +184,7 @@ class CompiledRun:
             self._simulator.AdvanceTo(end)
             self._simulator.clear_monitor()
             self._simulator.AdvancePendingEvents()
-            self._write_back(count)
+            self.write_back(count)
         except (DrakeDaeError, RuntimeError):
             if refused is not None:
                 raise refused from None
@@ -150,7 +193,15 @@ class CompiledRun:
             seen(self._context, count)
         return True
 
-    def _write_back(self, count: int) -> None:
+    def row(self, time: float) -> FloatArray:
+        """The values of the ports at a time in s, before the updates of that time."""
+        if time > self._own.get_time():
+            self._simulator.AdvanceTo(time)
+        self.steps, port = self._simulator.get_num_steps_taken(), self._block.GetOutputPort(ROW)
+        row: FloatArray = port.Eval(self._block.GetMyContextFromRoot(self._own))
+        return row
+
+    def write_back(self, count: int) -> None:
         """Sets time, states and logs of the diagram as wired, after some more steps."""
         own, context, composed = self._own, self._context, self.composed
         context.SetTime(own.get_time())
@@ -172,7 +223,14 @@ class CompiledRun:
                     known.AddData(time, row)
                 log.Clear()
             elif not isinstance(system, SceneGraph):
-                _copy_state(at_copy, system.GetMyMutableContextFromRoot(context))
+                # Drake's copy of a context has all parameters as well.
+                wired = system.GetMyMutableContextFromRoot(context)
+                states = at_copy.get_state().get_abstract_state()
+                for index in range(states.size()):
+                    kept = wired.get_mutable_state().get_mutable_abstract_state()
+                    kept.get_mutable_value(index).SetFrom(states.get_value(index))
+                for index in range(at_copy.num_discrete_state_groups()):
+                    wired.SetDiscreteState(index, at_copy.get_discrete_state(index).value())
 
 
 _GOES_ON = EventStatus.DidNothing()
@@ -182,22 +240,24 @@ def _is_traced(system: System) -> bool:
     return isinstance(system, TracedSystem) or symbolic_block(system) is not None
 
 
-def _copy(system: System) -> System:
-    """Another instance of a system of Drake, or of one of ours that says how."""
-    again = getattr(system, "again", None)
-    copy = system.Clone() if again is None else again()
-    copy.set_name(system.get_name())
-    return copy
+def upstream(leaves: Leaves, ports: Iterable[Port], ends: Container[Port] = ()) -> set[System]:
+    """The systems that lead to some ports, no farther than to those of `ends`."""
+    found, todo = set[System](), [*ports]
+    while todo:
+        port = todo.pop()
+        if port not in ends and port[0] not in found:
+            found.add(port[0])
+            todo += [source for place, source in leaves.sources.items() if place[0] is port[0]]
+    return found
 
 
-def _copy_state(source: Context, target: Context) -> None:
-    """Copies discrete and abstract states; Drake's copy of a context has all parameters as well."""
-    states = source.get_state().get_abstract_state()
-    copies = target.get_mutable_state().get_mutable_abstract_state()
-    for index in range(states.size()):
-        copies.get_mutable_value(index).SetFrom(states.get_value(index))
-    for index in range(source.num_discrete_state_groups()):
-        target.SetDiscreteState(index, source.get_discrete_state(index).value())
+def parameters_in(composed: Composed, context: Context) -> FloatArray:
+    """All numeric parameters of a block's leaves in a context of the diagram."""
+    values = [np.zeros(0)]
+    for local in (context_in(system, context) for system in composed.parameters):
+        groups = range(local.num_numeric_parameter_groups())
+        values += [local.get_numeric_parameter(i).CopyToVector() for i in groups]
+    return np.concatenate(values)
 
 
 def _is_by_wires(diagram: Diagram, context: Context) -> bool:

@@ -12,7 +12,7 @@ from runs import scenario
 
 from drake_dae import build_scenario, export_controller
 from drake_dae.errors import ModelError
-from drake_dae.running.export.loop import fixed_steps
+from drake_dae.running.export import fixed_steps
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 

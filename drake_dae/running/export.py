@@ -1,4 +1,4 @@
-"""The controller of a loop, all between what is measured and the control, as one step in C99."""
+"""The controller of a loop as one step in C99, and a whole loop in C99 that runs over time."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -8,31 +8,42 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
+from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType
+from pydrake.systems.primitives import RandomSource
 
 from drake_dae.arguments import checked
+from drake_dae.blocks import machine
 from drake_dae.blocks.block import Block, stacked
-from drake_dae.blocks.compose import Composed, Leaves, Port, compose, leaf_inputs, leaf_port
+from drake_dae.blocks.compose import Composed, Leaves, compose, leaf_inputs, leaf_port
+from drake_dae.blocks.stepping import FIXED, tableau_of
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.export.c_code import (
+from drake_dae.running.c_code import (
     MOST,
     BlockCode,
     Vectors,
     file_of,
+    numbers,
+    prefix_of,
     recorded_run,
     signals_of,
     write_replay,
     written,
 )
-from drake_dae.systems.plant import Plant
+from drake_dae.running.merged_run import upstream
+from drake_dae.systems.plant import Plant, port_signals
 from drake_dae.trace.compiled import generate, renamed, without_branches
 
 CONTROL = "control"  # The name of a controller's output port and a plant's input port.
 FINEST = 1000  # The largest ratio of the shortest sample period to the common period.
-# A step of the program that plays a run.
-STEP = """
+# The method and the longest step in s of a loop, in place of error control, which no export has.
+SCHEME, LONGEST = "runge_kutta5", 1e-3
+SAMPLING = "give the loop a sampling, in a scenario `sampling: {period: 0.001}`"
+
+# A step of the program that plays a run, of a controller and of a loop.
+CONTROLLER_STEP = """
 static int step(int k, double *found) {{
   {prefix}_controller_inputs in;
   {prefix}_controller_outputs out;
@@ -45,8 +56,13 @@ static int step(int k, double *found) {{
   return out.status;
 }}
 """
-
-SAMPLING = "give the loop a sampling, in a scenario `sampling: {period: 0.001}`"
+LOOP_STEP = """
+static int step(int k, double *found) {{
+  const int status = {prefix}_loop_advance(&own, rows[k][0]);
+  memcpy(found, &own.outputs, sizeof(double) * OUTPUTS);
+  return status;
+}}
+"""
 
 
 @checked(ModelError)
@@ -90,7 +106,7 @@ def export_controller(
     run = recorded_run(diagram, context, config or SimulatorConfig(), *given)
     words = part.words(name, start)
     files = {f"{file_of(name)}_controller.{end}": f"controller.{end}" for end in ("h", "c")}
-    step = {"step": STEP.format(prefix=words["prefix"]), "calls": "1000000"}
+    step = {"step": CONTROLLER_STEP.format(prefix=words["prefix"]), "calls": "1000000"}
     made = written(folder, files, words)
     return [*made, *write_replay(code, "controller", name, folder, run, step)]
 
@@ -159,11 +175,11 @@ class ControllerPart:
         control = leaves.sources.get(place)
         if control is None:
             raise ModelError(f"nothing leads to the control of '{plant.get_name()}'")
-        upstream = _upstream(leaves, control, {leaf_port(port) for port in measured.values()})
+        leading = upstream(leaves, [control], {leaf_port(port) for port in measured.values()})
         outputs = {CONTROL: control[0].get_output_port(control[1])}
         for port in map(diagram.get_output_port, range(diagram.num_output_ports())):
             is_vector = port.get_data_type() == PortDataType.kVectorValued and port.size()
-            if is_vector and leaf_port(port)[0] in upstream and leaf_port(port) != control:
+            if is_vector and leaf_port(port)[0] in leading and leaf_port(port) != control:
                 outputs.setdefault(port.get_name(), port)
         composed = compose(diagram, outputs, cuts=measured, context=context)
         block, self.acts_at_once = _checked(composed, measured)
@@ -172,7 +188,7 @@ class ControllerPart:
                 f"the controller acts continuously, and as one step it needs samples: {SAMPLING}"
             )
         known: Vectors = {
-            **plant.port_signals,
+            **port_signals(plant.structure),
             **plant.further_signals,
             "estimated_state": plant.dae.state_signals,
             "measured_force": plant.dae.constraint_input_signals,
@@ -240,17 +256,6 @@ def _machine(diagram: Diagram) -> Iterator[Any]:
             yield from _machine(system)
 
 
-def _upstream(leaves: Leaves, port: Port, ends: set[Port]) -> set[System]:
-    """The systems between some ports and a port."""
-    found, todo = set[System](), [port]
-    while todo:
-        port = todo.pop()
-        if port not in ends and port[0] not in found:
-            found.add(port[0])
-            todo += [source for place, source in leaves.sources.items() if place[0] is port[0]]
-    return found
-
-
 def _checked(composed: Composed, measured: Mapping[str, OutputPort]) -> tuple[Block, bool]:
     """A controller's block without outputs that act at once, and whether its control does."""
     block = composed.block
@@ -278,3 +283,97 @@ def _checked(composed: Composed, measured: Mapping[str, OutputPort]) -> tuple[Bl
     inputs = {name: symbol for name, symbol in block.inputs.items() if name not in left_out}
     acts_at_once = bool(ca.depends_on(outputs[CONTROL], given))
     return replace(block, inputs=inputs, outputs=outputs), acts_at_once
+
+
+@checked(ModelError)
+def export_loop(
+    loop: ClosedLoop | Diagram,
+    context: Context,
+    name: str,
+    folder: str | Path,
+    config: SimulatorConfig | None = None,
+    duration: float = 1.0,
+) -> list[Path]:
+    """Writes a whole loop, or any diagram that can be compiled, as C99 that runs over time.
+
+    Plant, sensors and controller are integrated by the stepper of rollouts, in the fixed steps of
+    the config; with error control, or for None, they are at most 1 ms by `runge_kutta5`.
+    name_loop.h describes the functions. Outputs are the signals of a record; of a diagram, its
+    vector output ports. The program play_name_loop.c compares with a recorded run of Drake's
+    Simulator from the context on, of at most 2000 steps, name_loop_run.csv; `make` in the folder
+    runs it.
+
+    Raises:
+        ModelError: It has Drake's own contact, noise, or a block that cannot be traced; or the
+            fixed steps are of an implicit method.
+    """
+    diagram = loop if isinstance(loop, Diagram) else loop.diagram
+    known: Vectors = {} if isinstance(loop, Diagram) else loop.signals
+    ports = {name: diagram.GetOutputPort(name) for name in known} or None
+    composed = compose(diagram, ports, context=context, shares=False)
+    check_traced(composed, "the loop")
+    code, start = BlockCode(composed, context, {}, known), context.get_time()
+    scheme, step = fixed_steps(config)
+    same = SimulatorConfig(integration_scheme=scheme, max_step_size=step, use_error_control=False)
+    times = [start + k * step for k in range(max(1, min(MOST, round(duration / step))))]
+    outputs = {n: leaf_port(diagram.GetOutputPort(n)) for n in code.outputs}
+    run = recorded_run(diagram, context, same, times, code, {}, outputs)
+    files = write_loop(code, start, name, folder, config)
+    words = {"step": LOOP_STEP.format(prefix=prefix_of(name)), "calls": "20000"}
+    return [*files, *write_replay(code, "loop", name, folder, run, words)]
+
+
+def check_traced(composed: Composed, what: str) -> None:
+    """Refuses a part of a diagram that depends on Drake's own contact, or on noise."""
+    for name, (system, _) in composed.cuts.items():
+        if isinstance(system, RandomSource):
+            raise ModelError(
+                f"{what} draws random numbers ('{system.get_name()}'), which no export does: leave "
+                "the noise out, in a scenario noise_deviation"
+            )
+        raise ModelError(
+            f"{what} depends on '{name}', which cannot be traced, such as a MultibodyPlant with "
+            "Drake's own contact: a CompliantPlant takes its place"
+        )
+
+
+def write_loop(
+    code: BlockCode, time: float, name: str, folder: str | Path, config: SimulatorConfig | None
+) -> list[Path]:
+    """Writes a loop from its start time in s on as name_loop.h and name_loop.c."""
+    scheme, longest = fixed_steps(config)
+    steps, tableau, file = code.steps, tableau_of(scheme), file_of(name)
+    begin = ""
+    if "begin" in steps.functions:
+        begin = """  memcpy(held, l->held, sizeof(held));
+  dae_begin(0, &l->time, l->state, held, l->parameters, l->held);
+"""
+    start = steps.block.default("state")
+    words = code.words(name) | {
+        "stepper": machine.source(steps, []),
+        "begin": begin,
+        "scheme": scheme,
+        "longest": repr(longest),
+        "start": repr(time),
+        "num_states": str(start.size),
+        "state": numbers(start),
+        "stages": str(tableau.b.size),
+        "method_a": numbers(tableau.a.ravel()),
+        "method_b": numbers(tableau.b),
+        "method_c": numbers(tableau.c),
+        "periods": numbers(np.array([rate.period for rate in steps.rates])),
+        "offsets": numbers(np.array([rate.offset for rate in steps.rates])),
+    }
+    return written(folder, {f"{file}_loop.{end}": f"loop.{end}" for end in ("h", "c")}, words)
+
+
+def fixed_steps(config: SimulatorConfig | None) -> tuple[str, float]:
+    """The method of fixed steps and the longest step in s."""
+    if config is None or config.use_error_control:
+        return SCHEME, LONGEST if config is None else min(LONGEST, config.max_step_size)
+    if config.integration_scheme not in FIXED:
+        raise ModelError(
+            f"integration_scheme: an export takes no fixed steps of {config.integration_scheme}; "
+            f"choose {', '.join(FIXED)}, or use_error_control"
+        )
+    return config.integration_scheme, config.max_step_size

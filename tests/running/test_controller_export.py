@@ -14,7 +14,7 @@ from runs import MANY_PIECES, scenario
 
 from drake_dae import CompliantPlant, build_scenario, export_controller, make_closed_loop
 from drake_dae.errors import ModelError
-from drake_dae.running.export.controller import ControllerPart, Ticks
+from drake_dae.running.export import ControllerPart, Ticks
 from drake_dae.systems import PointMaterial
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")

@@ -15,9 +15,9 @@ from runs import first_quick, scenario, some
 
 from drake_dae import DaePlant, DaeSystem, build_scenario, simulate
 from drake_dae.errors import NonFiniteError
-from drake_dae.running import compiled_run
+from drake_dae.running import merged_run
 from drake_dae.running import simulate as simulation
-from drake_dae.running.compiled_run import CompiledRun
+from drake_dae.running.merged_run import MergedRun
 
 NOISE = "sensors.force={sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
 
@@ -41,7 +41,7 @@ DEAR = ("hydroelastic contact", "noise", "a start between two samples")
 @pytest.fixture
 def short_runs(monkeypatch):
     """Short runs are computed in this way, too."""
-    monkeypatch.setattr(compiled_run, "WORTH", 1)
+    monkeypatch.setattr(merged_run, "WORTH", 1)
 
 
 @cache
@@ -136,11 +136,11 @@ def test_a_fixed_value_at_a_connected_port_counts(short_runs):
     chosen, loop, context = built("observer and integrals")
     Simulator(loop.diagram, context).Initialize()
     given = chosen.integrator, 0.01
-    assert CompiledRun.of(loop.diagram, context.Clone(), *given) is not None
+    assert MergedRun.of(loop.diagram, context.Clone(), *given) is not None
     port = loop.plant.GetInputPort("control")
     port.FixValue(loop.plant.GetMyMutableContextFromRoot(context), np.zeros(7))
     simulate(loop.diagram, context, 0.01, chosen.integrator)
-    assert CompiledRun.of(loop.diagram, context, *given) is None
+    assert MergedRun.of(loop.diagram, context, *given) is None
 
 
 def test_a_trial_out_of_the_domain_does_not_end_it(short_runs):
@@ -172,13 +172,13 @@ def test_drake_goes_on_from_samples_that_fail(short_runs, monkeypatch):
     """So a failure is that of Drake's Simulator; here it finds a step after all."""
     chosen, loop, context = built("observer and integrals")
 
-    class Failing(CompiledRun):
-        def _write_back(self, count):
+    class Failing(MergedRun):
+        def write_back(self, count):
             if self._own.get_time() > 0.0445:
                 raise RuntimeError("no convergence.")
-            super()._write_back(count)
+            super().write_back(count)
 
-    monkeypatch.setattr(simulation, "CompiledRun", Failing)
+    monkeypatch.setattr(simulation, "MergedRun", Failing)
     expected, seen = context.Clone(), []
     statistics = simulate(
         loop.diagram, context, 0.06, chosen.integrator, look=lambda now: seen.append(now.get_time())
