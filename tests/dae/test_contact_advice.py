@@ -73,7 +73,7 @@ def test_errors_and_roughness_are_those_of_the_gains(numbers):
 
 
 def test_noise_is_met_by_equal_poles_and_a_slow_estimator():
-    """Butterworth's poles need one of 133 1/s, where twice the mass is not known: 2.4 the error."""
+    """Butterworth's poles need one of 133 1/s, where twice the mass is unknown, with 0.12 mm."""
     noise, quiet = SensorNoise(5e-5, 1e-2, 3.0), SensorNoise(3e-6, 0.0, 0.05)
     given = SensedContact(T, 1, 1e5, 0.03, 0.59, 0.98, 0.29, 8.0, noise, estimates=True)
     found = advised_gains(given, 1.0)
