@@ -26,7 +26,8 @@ from drake_dae.files import check_unwritten
 from drake_dae.pictures import ANIMATION, PLOTS
 from drake_dae.pictures.animation import make_animation
 from drake_dae.running.interruption import Interruption, end_at_once, ending_signals
-from drake_dae.running.simulate import RunStatistics, simulate
+from drake_dae.running.judgement import RunStatistics
+from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_completed, build_scenario, for_rollout, roll_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.scenario import load_scenario, save_scenario, scenario_data

@@ -34,8 +34,7 @@ from drake_dae.scenario.robot_file.reading import robot_links
 from drake_dae.scenario.scenario import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.studies.runs import Outcome
-from drake_dae.studies.study import FILES
+from drake_dae.studies.study import FILES, Outcome
 from drake_dae.studies.sweep import sweep
 from drake_dae.studies.variations import parse_variations
 

@@ -17,6 +17,7 @@ from drake_dae.trace.factorization import PositiveDefiniteFactorization, nonzero
 from drake_dae.trace.functions import TracedFunction, count_operations
 from drake_dae.trace.numerics import (
     PRECISION,
+    ROUND_OFF,
     ROUNDING,
     NewtonModel,
     are_dependent,
@@ -24,6 +25,7 @@ from drake_dae.trace.numerics import (
     norm,
     polished,
     positive,
+    row_lengths,
     shortest_steps,
     steps_along,
     unit_rows,
@@ -31,6 +33,7 @@ from drake_dae.trace.numerics import (
 
 POLE = 1e-3  # A larger residual, over its usual change by the scale of the states, is no round-off.
 NEAR_POLE = 1e-6, 1e-3  # The distances at which poles show, in states over their scale.
+SEARCH = 200  # The largest number of steps where gradients are dependent; a dozen are enough.
 RESTARTS = 12  # The number of random starts of `Manifold.settle`.
 # A velocity is kept if no state moves further for it than so many times the size of the state.
 FAR = 100.0
@@ -128,8 +131,7 @@ class Manifold:
         residual = self.residual_function.evaluate(state, parameters)[0]
         if not residual.any():
             return 0.0
-        length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)
-        return norm(residual / positive(length))
+        return norm(residual / row_lengths(self.gradients(state, parameters) * self.scale))
 
     @np.errstate(all="ignore")
     def _step(self, state: FloatArray, p: FloatArray) -> FloatArray | None:
@@ -185,10 +187,8 @@ class Manifold:
 
         first = start / scale
         z, converged = newton(first, linearize)
-        if not converged:
-            # Gradients are dependent or steps diverge: least squares with decreasing residual.
-            z, converged = newton(first, lambda z: self._downhill(scale * z, p))
-        found: FloatArray = scale * z
+        # Gradients are dependent, or steps diverge.
+        found: FloatArray = scale * z if converged else self._downhill(start, p)
         # Otherwise the residual is round-off in coarse units, or no state changes it.
         if not converged and not self._relative_size(found, p) <= CONSISTENT:
             why = "the end of Newton's method: start nearer to the constraint"
@@ -200,16 +200,27 @@ class Manifold:
             raise self._failed(found, p, why)
         return found
 
-    def _downhill(self, state: FloatArray, p: FloatArray) -> NewtonModel | None:
-        """Least-squares steps that decrease the residual; its rows are scaled to length one."""
-        gradients = self.gradients(state, p) * self.scale
-        length = positive(np.linalg.norm(gradients, axis=1))
-
-        def residual(z: FloatArray) -> FloatArray:
-            return self.residual_function(self.scale * z, p)[0]
-
-        steps = shortest_steps(gradients, residual)
-        return steps and steps._replace(measure=lambda z: norm(residual(z) / length))
+    def _downhill(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """The end of damped least-squares steps, each of which decreases the residual."""
+        z, damping, scale = start / self.scale, 1.0, self.scale
+        gradients = self.gradients(start, p) * scale
+        length = row_lengths(gradients)
+        residual = self.residual(start, p) / length
+        for _ in range(SEARCH):
+            size = norm(residual)
+            if not (np.isfinite(gradients).all() and 0.0 < size < np.inf):
+                break
+            u, s, v = np.linalg.svd(gradients / length[:, None], full_matrices=False)
+            step = (u.T @ residual) * s / positive(s * s + damping * size) @ v
+            following = self.residual(scale * (z - step), p) / length
+            if norm(following) < size:
+                z, residual, damping = z - step, following, 1.0
+                gradients = self.gradients(scale * z, p) * scale
+            elif size <= ROUND_OFF * (1.0 + norm(z)):
+                break
+            else:
+                damping *= 4.0
+        return np.asarray(scale * z)
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:

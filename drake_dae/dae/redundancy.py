@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray
@@ -15,20 +14,10 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Samples, draw
 from drake_dae.dae.signals import places_of
 from drake_dae.dae.system import DaeSystem, ForceSharing
-from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
-from drake_dae.trace.numerics import (
-    ROUND_OFF,
-    equilibrated,
-    positive,
-    rank_of,
-    row_lengths,
-    significant,
-    without_round_off,
-)
+from drake_dae.trace.numerics import equilibrated, rank_of, significant, without_round_off
 
-# The largest number of steps to a state where all constraints hold; a dozen are enough.
-SEARCH = 200
 # The next constraint to keep is the first whose independence of those already kept is at least
 # this fraction of the best.
 PREFERRED = 0.5
@@ -154,38 +143,8 @@ def manifold_of_left_out(system: DaeSystem) -> Manifold | None:
 
 def all_constraints_hold(system: DaeSystem) -> Samples:
     """Returns random states around the nominal state at which all constraints k_i hold."""
-    return Samples(_Redundant(system), draw(system, None, 12, 0))
-
-
-class _Redundant(Manifold):
-    """The states at which all constraints k_i hold, including redundant ones."""
-
-    def __init__(self, system: DaeSystem) -> None:
-        super().__init__(system, [[row] for row in ca.vertsplit(system.k)])
-
-    def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        scale = self.system.scale
-        z = self.system.state_vector(state) / scale
-        gradients = self.gradients(scale * z, parameters) * scale
-        length = row_lengths(gradients)
-        residual = self.residual(scale * z, parameters) / length
-        damping = 1.0
-        for _ in range(SEARCH):
-            size = float(np.linalg.norm(residual))
-            u, s, v = np.linalg.svd(gradients / length[:, None], full_matrices=False)
-            step = (u.T @ residual) * s / positive(s * s + damping * size) @ v
-            following = self.residual(scale * (z - step), parameters) / length
-            if not np.linalg.norm(following) < size:
-                if size <= ROUND_OFF * (1.0 + np.linalg.norm(z)):
-                    return np.asarray(scale * z)
-                damping *= 4.0
-                continue
-            z, residual, damping = z - step, following, 1.0
-            gradients = self.gradients(scale * z, parameters) * scale
-        raise InconsistentStateError(
-            f"{self.system.name}: no state found near the given one at which all constraints hold",
-            residual * length,
-        )
+    alone = Manifold(system, [[row] for row in ca.vertsplit(system.k)])
+    return Samples(alone, draw(system, None, 12, 0))
 
 
 def _split(system: DaeSystem, names: Sequence[str]) -> tuple[list[int], list[int]]:

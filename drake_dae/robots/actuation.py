@@ -179,15 +179,12 @@ class FlexibleJoints(Stage):
         M(q_1) q_1'' + H = J^T lambda + K_2 (q_2 - q_1) + D (q_2' - q_1'),
         M_2 q_2'' + K_2 (q_2 - q_1) + D (q_2' - q_1') = u.
 
-    A law with a delay compensates the springs late, and needs poles that are fast beside them; the
-    law takes accelerations of the links from its model. Model springs that are too stiff for the
-    sample time as rigid joints.
-
     The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4 for
-    positions and 2 for forces; 3 and 1 with damping. Damping adds zero dynamics of dimension p,
-    which the law does not change: K_2 d + D d' = tau for the deflections d, with the rates of D^-1
-    K_2. They are stable, but limit the step of an explicit integrator. The law needs positions and
-    velocities of links and shafts. The plant has the port `motor_state`, (q_2, q_2'), shape (2p,).
+    positions and 2 for forces; 3 and 1 with damping, which adds stable zero dynamics of dimension
+    p, K_2 d + D d' = tau for the deflections d: they limit the step of an explicit integrator. A
+    law with a delay needs poles that are fast beside the springs; model springs that are too stiff
+    for the sample time as rigid joints. The law needs positions and velocities of links and shafts.
+    The plant has the port `motor_state`, (q_2, q_2'), shape (2p,).
 
     Attributes:
         stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite. All are
@@ -197,9 +194,8 @@ class FlexibleJoints(Stage):
         damping: D in N m s/rad (N s/m), likewise positive definite; 0 for none.
         friction: Coulomb friction of the motors, F_c in N m (N), not negative, a number or shape
             (p,): u less F_c s drives the shafts, with s_i = q_2i' / sqrt(q_2i'^2 + v_s^2), which
-            creeps below v_s. None for none and no such parameters; 0 for motors whose friction the
-            law does not know, so that a plant may have other values. The law (28) differentiates s
-            if F_c is not 0 in its model.
+            creeps below v_s. None for none and no such parameters; 0 for a law that does not know
+            it, while the plant may have other values.
         stiction_tolerance: v_s in rad/s (m/s), positive; only with friction.
     """
 

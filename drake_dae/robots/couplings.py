@@ -34,8 +34,7 @@ class FixedDistance(Constraint):
     exerts it on B away from A, and B the opposite on A; negative is tension. The parameter
     "<name>.length" is its length.
 
-    The length must not be zero, since phi then has no gradient: use `CoincidentPoints`. For a point
-    on a sphere in the world use `PointOnSurface`. A rope, which can only pull, is not covered.
+    A length of zero has no gradient: use `CoincidentPoints`. A rope is not covered.
 
     Attributes:
         frame_a: Name of frame A, for example "world".
@@ -132,15 +131,14 @@ class WeldedFrames(Constraint):
         phi(q) = (p_AB(q) - p, 2 tan(theta / 2) n),    R_AB(q) R^T = turn by theta about n,
 
     all in the axes of A. The constraint force is what A exerts on B, a force in N at B's origin and
-    a moment in N m, in the axes of A; B exerts the opposite on A at the same point. For at phi = 0
-    phi' = (v, w), the velocity and angular velocity of B in A, so that lambda^T phi' is the power
-    of such a force and moment: p_AB' = v, and with E = R_AB R^T, E' = w x E, the orientation error
+    a moment in N m, in the axes of A; B exerts the opposite on A at the same point. For with E =
+    R_AB R^T and the angular velocity w of B in A the orientation error
 
         r = 2 tan(theta / 2) n = 2 vee(E - E^T) / (1 + tr E)
 
     has r' = w + w x r / 2 + (w . r) r / 4, which is w at r = 0. It is smooth up to half a turn,
-    where it is infinite. Unlike the sine of theta its only zero is the pose itself. The parameter
-    "<name>.position" is p.
+    where it is infinite, and its only zero is the pose itself. The parameter "<name>.position" is
+    p.
 
     Attributes:
         frame_a: Name of frame A; it may be "world".
@@ -196,13 +194,9 @@ class JointCoupler(Constraint):
     n_1 and n_2 teeth that mesh have the ratio -n_1 / n_2 from the first to the second; a rack on a
     pinion of radius r has r, in m/rad, with the unit "m" of the follower.
 
-    The constraint force is the generalized force on the follower, in N m (N with the unit "m"):
-    positive pushes the follower toward larger positions, and the leader gets -ratio times it. It
-    acts on the child of each joint along the joint's axis, and the opposite on the parent, so the
-    housing of a gear carries the difference. The parameters "<name>.ratio" and "<name>.offset" are
-    its numbers.
-
-    Backlash, elastic belts and one-way drives are not covered. Weld a joint that must not move.
+    The constraint force is the generalized force on the follower, in N m (N with the unit "m"), and
+    the leader gets -ratio times it. It acts on the child of each joint along the joint's axis, and
+    the opposite on the parent. The parameters "<name>.ratio" and "<name>.offset" are its numbers.
 
     Attributes:
         follower: Name of the position that follows, as in the links' `position_signals`.

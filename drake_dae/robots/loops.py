@@ -36,8 +36,8 @@ class LoopJoint(Constraint):
     and B the opposite on A, where u is the motor's force, if it has a motor: a control of the
     robot, after those of its other actuators. These forces are not on the port
     `constraint_wrenches`. c and c' are on the port `loop_state` of `RobotPlant`, and c can be an
-    output, by `SurfaceCoordinates`. Limits are not enforced: reports and summaries say where c
-    exceeds them. Its motor is rigid, without rotor inertia; else cut the loop at another joint.
+    output, by `SurfaceCoordinates`. Limits are not enforced: reports say where c exceeds them. Its
+    motor is rigid, without rotor inertia; else cut the loop at another joint.
 
     Attributes:
         frame_a: Name of frame A, of the parent; it may be "world".

@@ -44,19 +44,17 @@ class PointOnSurface(Constraint):
     regularized Coulomb friction with the speed v_s, and viscous friction. It does not stick: below
     v_s the point creeps. The parameters "<name>.friction", "<name>.stiction_tolerance" and
     "<name>.viscous_friction" are mu, v_s and d; plant and law may have different values if both
-    have these parameters; use 0 for a surface that has them but no friction. If friction reverses
-    the effect of lambda on phi'', the Painleve paradox occurs: see `dae.contacts`. With
-    flexible joints, motors or hydraulics the law differentiates s, whose slopes are 1 / v_s; then
-    v_s = 0.01 m/s (0.03 m/s with hydraulics, or fixed steps of 5 ms) avoids peaks of the control at
-    reversals. With rigid joints v_s does not affect the law.
+    have them, also 0. If friction reverses the effect of lambda on phi'', the Painleve paradox
+    occurs: see `dae.contacts`. Behind flexible joints, motors or hydraulics the law differentiates
+    s, whose slopes are 1 / v_s; v_s = 0.01 m/s (0.03 m/s with hydraulics, or fixed steps of 5 ms)
+    avoids peaks of the control at reversals.
 
     Attributes:
         frame: Name of the frame.
         surface: A surface in the world.
         point: The point in the frame, m, shape (3,).
         name: The name of the constraint, the prefix of its force and its parameters.
-        rpy: Roll, pitch and yaw of the surface, rad, shape (3,): about the fixed axes x, y, z in
-            this order, as in Drake. None for no rotation and no such parameter.
+        rpy: Roll, pitch and yaw of the surface, rad, shape (3,); None for no such parameter.
         friction: mu, not negative; None for no friction and no such parameters.
         stiction_tolerance: v_s in m/s, Drake's stiction tolerance; only with friction.
         viscous_friction: d in N s/m, not negative; None for none, without a parameter.
@@ -210,10 +208,9 @@ class AxisNormalToSurface(Constraint):
     the normal turns as the point moves, so the surface also exerts a force at the point, which
     follows from the moments. The environment gets the opposite.
 
-    It restricts the direction only: the point may leave the surface, and the frame may turn about
-    the axis. With a `PointOnSurface` at the same point a disk lies flush. For a tool whose axis
-    points towards the surface, give the negative axis. The parameter "<name>.position" is the
-    position of the surface; move it together with that of the `PointOnSurface`.
+    It restricts the direction only; with a `PointOnSurface` at the same point a disk lies flush.
+    For a tool whose axis points towards the surface, give the negative axis. The parameter
+    "<name>.position" is the position of the surface; move it with that of the `PointOnSurface`.
 
     Attributes:
         frame: Name of the frame.

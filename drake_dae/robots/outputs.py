@@ -265,15 +265,11 @@ class Squeeze(ForceOutput):
 
     with the forces f that the contacts exert on the object at the points p; positive where they
     press toward each other. If the contacts transmit forces along e_ij, as `CoincidentPoints` and
-    `WeldedFrames` do, then lambda = S^T c is e_ij c / 2 at i and the opposite at j. Their sum is
-    zero, and so is the sum of their moments, (p_i - p_j) x e_ij c / 2. So the row lies in the null
-    space of the object's grasp map: it squeezes the object and does not move it. Three contacts in
-    a triangle have three such outputs, which span their internal forces. Of the six between four
-    contacts in one plane only five are independent: the remaining internal force is normal to that
-    plane, up at two opposite contacts and down at the others.
+    `WeldedFrames` do, the row lies in the null space of the object's grasp map: it squeezes the
+    object and does not move it. Three contacts in a triangle have three such outputs, which span
+    their internal forces; of the six between four contacts in one plane five are independent.
 
-    For unilateral contacts it does not guarantee that each normal force is positive: see the table
-    of a run. For the force of a single contact give its name, or use a `ForceCombination`.
+    It does not guarantee that each normal force of unilateral contacts is positive.
 
     Attributes:
         frame: The name of the object's frame, on which both constraints act. It may be "world", for

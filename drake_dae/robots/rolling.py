@@ -88,9 +88,8 @@ class RollingWheel(_RestingPoint):
     and s; the ground gets the opposite. Positive rotation about the axle moves the wheel forward.
     The parameter "<name>.radius" is the radius.
 
-    It does not restrict the height, so that it is not redundant to joints that do. For a floating
-    base, keep the center of each wheel at its height by a `PointOnSurface`. For a second wheel on
-    the same axle set holds_side = False, since its side constraint is redundant.
+    It does not restrict the height: for a floating base, keep the center of each wheel there by a
+    `PointOnSurface`. For a second wheel on the same axle set holds_side = False.
 
     Attributes:
         frame: Name of a frame on the wheel.

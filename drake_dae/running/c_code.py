@@ -6,6 +6,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from string import Template
+from textwrap import fill
 
 import casadi as ca
 import numpy as np
@@ -28,10 +29,9 @@ Vectors = Mapping[str, Sequence[Signal]]  # Name of a vector -> names and units 
 class BlockCode:
     """A part of a diagram as functions in C, and its numbers at a start.
 
-    Each input of the block is a parameter of these functions: first come the parameters of the
-    block, then inputs that keep their value in the context (`places`), and last `inputs`, those of
-    each step. `parameters` and `values` are without these. Held values that are nan at the start
-    come from the function "begin". `known` names outputs whose blocks do not name them.
+    Parameters of the functions are those of the block, then inputs that keep their value
+    (`places`), and last `inputs`, those of each step, which `parameters` and `values` leave out.
+    `known` names outputs whose blocks do not name them.
     """
 
     def __init__(
@@ -159,18 +159,13 @@ def numbers(values: FloatArray) -> str:
 
 def strings(texts: Iterable[str]) -> str:
     """A C initializer list of strings, with a null pointer at its end."""
-    return braced([*map(string, texts), "0"])
+    rows = ",\n  ".join([*map(string, texts), "0"])
+    return f"{{{rows}}}"
 
 
 def braced(items: Sequence[str]) -> str:
-    """A C initializer list, wrapped to short lines."""
-    lines, last = [], ""
-    for item in items:
-        if last and len(last) + len(item) > 96:
-            lines.append(last.rstrip())
-            last = ""
-        last += f"{item}, "
-    text = "\n  ".join([*lines, last]).rstrip(", ")
+    """A C initializer list of items without spaces in strings, wrapped to short lines."""
+    text = fill(", ".join(items), 98, subsequent_indent="  ", break_on_hyphens=False)
     return f"{{{text}}}"
 
 

@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from math import isfinite
 
 import numpy as np
@@ -26,24 +25,10 @@ from drake_dae.blocks.traced_system import check_context
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
 from drake_dae.running.diagnosis import RunWatch
 from drake_dae.running.interruption import Interruption, ending_signals
+from drake_dae.running.judgement import RunStatistics
 from drake_dae.running.merged_run import NO_EVENTS, MergedRun
 
 BAR_PERIOD = 0.1  # The time between updates of the progress bar, in s.
-
-
-@dataclass(frozen=True)
-class RunStatistics:
-    """Simulated and elapsed time in s, steps, and the signal that ended a run early, if any."""
-
-    simulated_time: float
-    wall_time: float
-    steps: int
-    interrupted: signal.Signals | None
-
-    @property
-    def times_real_time(self) -> float:
-        """Simulated seconds per second."""
-        return self.simulated_time / max(self.wall_time, 1e-9)
 
 
 @checked(ModelError, lasts=True)

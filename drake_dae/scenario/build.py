@@ -20,14 +20,8 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import ConstraintStructure, DaeSystem, Structure, TrackingLaw
 from drake_dae.dae.disturbance import estimated_within
+from drake_dae.diagrams import parts
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop, wire_loop
-from drake_dae.diagrams.parts import (
-    ENCODER_NOISE,
-    LoopSettings,
-    encoder_seed,
-    hold_sampling,
-    make_sensor,
-)
 from drake_dae.diagrams.record import Record, RecordAfter
 from drake_dae.errors import (
     AssumptionError,
@@ -43,12 +37,7 @@ from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.gains import (
-    advised,
-    estimates_all,
-    with_all_estimated,
-    with_friction_estimated,
-)
+from drake_dae.scenario.gains import advised, estimates_all, estimating_all, estimating_friction
 from drake_dae.scenario.model import (
     completed_model,
     exogenous_references,
@@ -59,11 +48,8 @@ from drake_dae.scenario.parts import Poles
 from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
-from drake_dae.systems.controller import Controller, Derived
-from drake_dae.systems.plant import Plant
-from drake_dae.systems.sensors import ForceSensor
-from drake_dae.systems.task import open_contact
-from drake_dae.systems.task_controller import TaskController
+from drake_dae.systems import Controller, ForceSensor, Plant, TaskController, open_contact
+from drake_dae.systems.controller import Derived
 
 # The rows of a record under error control, after the first; and the most rows of fixed steps: a
 # larger record takes gigabytes.
@@ -148,11 +134,11 @@ def build_completed(
     # The law, of a model with a disturbance if there is an estimator of it; and what it follows.
     of_law = scenario
     if estimates_all(scenario, model):
-        of_law = with_all_estimated(scenario, model)
+        of_law = estimating_all(scenario, model)
         try:
             law = tracking_law(of_law, completed_model(of_law)[1], structure)
         except (AssumptionError, ScenarioError) as error:  # No run is refused for it.
-            of_law = with_friction_estimated(scenario, model)
+            of_law = estimating_friction(scenario, model)
             law = tracking_law(of_law, model, structure)
             text = "only friction of contacts is estimated, no loads, tilts and joints"
             notes = *notes, f"{text}: {error}"
@@ -177,7 +163,7 @@ def build_completed(
         if not np.any(np.isfinite(limits)):
             text = "the robot's file has no effort limits, or not of these controls"
             raise ScenarioError(("saturation", text))
-    settings = LoopSettings(
+    settings = parts.LoopSettings(
         sensor=sensor,
         encoders=sensors.encoders,
         sampling=scenario.sampling,
@@ -192,10 +178,10 @@ def build_completed(
     period = settings.period(plant.time_step)
     if settings.sampling is not None:
         with at("sampling"):
-            hold_sampling(plant, settings.sampling)
+            parts.hold_sampling(plant, settings.sampling)
     if settings.encoders is not None:
         with at("sensors.encoders"):
-            make_sensor(plant, settings.encoders, period)
+            parts.make_sensor(plant, settings.encoders, period)
     with at("judgement.tolerances"):
         dae.places_of("output", scenario.judgement.tolerances, model.dae.output_signals)
 
@@ -380,7 +366,7 @@ def roll_scenario(
     if sensors.force is not None:
         seeds["force_noise"] = sensors.force.seed
     if sensors.encoders is not None:
-        seeds[ENCODER_NOISE] = encoder_seed(sensors.encoders.seed)
+        seeds[parts.ENCODER_NOISE] = parts.encoder_seed(sensors.encoders.seed)
     watch, due = DivergenceWatch(loop.plant, scenario.duration), time.perf_counter() + PERIOD
     seen: float | None = None
     failure: SimulationError | None = None

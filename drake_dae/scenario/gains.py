@@ -224,14 +224,14 @@ def estimates_all(scenario: Scenario, model: RobotModel) -> bool:
     return is_plain and is_rigid and not scenario.exogenous
 
 
-def with_friction_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
+def estimating_friction(scenario: Scenario, model: RobotModel) -> Scenario:
     """The scenario of a law whose estimator knows the friction of contacts that have it."""
     assert scenario.estimator is not None
     names = [c.friction_parameter for c in model.constraints if c.friction_parameter]
     return replace(scenario, estimator=replace(scenario.estimator, parameters=names))
 
 
-def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
+def estimating_all(scenario: Scenario, model: RobotModel) -> Scenario:
     """The scenario of a law whose estimator knows a load at each contact, planes and friction."""
     assert scenario.estimator is not None
     robot, frictional, constraints = scenario.robot, list[str](), list[WrittenConstraint]()

@@ -8,20 +8,8 @@ import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_dae.analysis import (
-    Analysis,
-    LimitKind,
-    LimitsAlong,
-    SignalRange,
-    Table,
-    along,
-    analyze,
-    digits,
-    examine,
-    limits_along,
-    robot_limits,
-    to_text,
-)
+from drake_dae import analysis as theory
+from drake_dae.analysis import LimitKind, LimitsAlong, SignalRange
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal, Structure, ZeroDynamics, find_structure
 from drake_dae.dae.advised_gains import RAMP
@@ -31,9 +19,14 @@ from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots import Constraint, LinkBehind, RobotModel, Surface, links_behind, own_values
-from drake_dae.running.judgement import FindingKind, Outcome, OutputQuality, RunFinding
-from drake_dae.running.simulate import RunStatistics
-from drake_dae.running.summary import RunSummary
+from drake_dae.running.judgement import (
+    FindingKind,
+    Outcome,
+    OutputQuality,
+    RunFinding,
+    RunStatistics,
+    RunSummary,
+)
 from drake_dae.scenario.build import check_task, tracking_law
 from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised, expected, moved_points, stated_errors
@@ -68,7 +61,7 @@ class Feasibility:
     limits, and None where they do.
     """
 
-    analysis: Analysis
+    analysis: theory.Analysis
     duration: float
     gains: str = ""
     is_resolved: bool = True
@@ -118,11 +111,11 @@ class Feasibility:
             moves = r.largest - r.least > 1e-9 * max(abs(r.least), abs(r.largest))
             low, high = (f"{t:.4g} s" * moves for t in (r.least_time, r.largest_time))
             remark = "" if r.beyond_time is None else f"left at {r.beyond_time:.4g} s"
-            row = [digits(r.least), low, digits(r.largest), high, limits, remark]
+            row = [theory.digits(r.least), low, theory.digits(r.largest), high, limits, remark]
             rows.append([r.signal.name, r.signal.unit or "1", *row])
         if rows:
             head = ["needed along the reference", "unit", "least", "at", "largest", "at", "limit"]
-            parts.append(Table([*head, ""], rows, left=2))
+            parts.append(theory.Table([*head, ""], rows, left=2))
         if motion is not None and motion.times.size:
             text = f"Started without errors, and examined at {motion.times.size} times."
             if not self.is_resolved:
@@ -132,7 +125,7 @@ class Feasibility:
                 )
             parts.append([text])
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])
-        return to_text(parts)
+        return theory.to_text(parts)
 
 
 def find_feasibility(scenario: Scenario) -> Feasibility:
@@ -144,11 +137,11 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     examined, structure, law = None, None, None
     try:
         if scenario.task is None:
-            examined = of_steered(model, examine)
+            examined = of_steered(model, theory.examine)
             structure = None if examined.problems else examined.structure
         structure = structure or scenario_structure(model)
     except AssumptionError:
-        return Feasibility(analyze(model.dae), scenario.duration)
+        return Feasibility(theory.analyze(model.dae), scenario.duration)
     try:
         law = tracking_law(advised(scenario, model, structure).scenario, model, structure)
     except ScenarioError as error:
@@ -156,7 +149,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
             raise
         gains = str(error)
     if examined is None:
-        return Feasibility(analyze(model.dae), scenario.duration, gains)
+        return Feasibility(theory.analyze(model.dae), scenario.duration, gains)
 
     # The motion along the reference, at times that resolve it.
     reference, start = reference_and_start(scenario, model, structure)
@@ -172,18 +165,18 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
 
     begin = scenario.integrator.start_time
     times, is_resolved = sample_times(signals, begin, begin + scenario.duration)
-    analysis = along(examined, reference, times, start, period or None, exogenous)
+    analysis = theory.along(examined, reference, times, start, period or None, exogenous)
     motion, found = analysis.motion, (scenario.duration, gains, is_resolved)
     if motion is None or not motion.times.size:
         return Feasibility(analysis, *found)
 
     # Its limits.
     with at("judgement.friction_cones"):
-        limits = robot_limits(model, scenario.judgement.friction_cones)
+        limits = theory.robot_limits(model, scenario.judgement.friction_cones)
     ranges = limits.ranges(motion.times, limits.of_motion(motion))
     behind, slowing = links_behind(model, motion.times, motion.states, motion.parameters), None
     if analysis.structure is not None:
-        slowing = limits_along(analysis.structure, limits, reference, motion)
+        slowing = theory.limits_along(analysis.structure, limits, reference, motion)
     return Feasibility(analysis, *found, ranges, behind, slowing)
 
 
@@ -226,7 +219,7 @@ def judge_run(
     wanted, remedies, notes = scenario.judgement, list[str](), list[str]()
     model, law, goal = loop.plant.robot("a scenario"), loop.controller.law, loop.generator
     dae, times, stop = model.dae, record.time, record.time.size
-    limits = robot_limits(model, wanted.friction_cones)
+    limits = theory.robot_limits(model, wanted.friction_cones)
     if failure:
         stop = max(1, int(np.searchsorted(times, times[-1] - BREAK * (times[-1] - times[0]))))
     ranges = limits.ranges(times[:stop], limits.of_record(record)[:stop])
@@ -247,7 +240,7 @@ def judge_run(
 
         some = times[:: times.size // MOST_TIMES + 1]
         motion = ZeroDynamics(dae, structure=structure).motion(reference, some, record["state"][0])
-        found = limits_along(structure, limits, reference, motion)
+        found = theory.limits_along(structure, limits, reference, motion)
         remedies.append("the references alone keep all limits" if found is None else found.remedy)
 
     # Approximations, and places beyond the data of surfaces.

@@ -13,6 +13,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
+from drake_dae import systems
 from drake_dae.arrays import unknown_name
 from drake_dae.dae import ConstraintStructure, GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import DrakeDaeError, GainError, ModelError
@@ -21,16 +22,7 @@ from drake_dae.robots import FrictionCone, RobotModel
 from drake_dae.scenario.form import Positive, at, expected
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Payload, Robot
-from drake_dae.systems.break_away import Observing
-from drake_dae.systems.compliant_plant import CompliantPlant
-from drake_dae.systems.contact_forces import DisturbanceForce
-from drake_dae.systems.contact_material import ContactMaterial, PointMaterial
-from drake_dae.systems.contact_plant import ContactPlant
-from drake_dae.systems.ideal_plants import RobotPlant
-from drake_dae.systems.phases import Phase
-from drake_dae.systems.plant import Plant
-from drake_dae.systems.sensors import Encoders
-from drake_dae.systems.task import Task
+from drake_dae.systems import Observing, Plant, PointMaterial
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +38,7 @@ class ScenarioPlant(ABC):
 
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
     payloads: list[Payload] = field(default_factory=list)
-    disturbances: list[DisturbanceForce] = field(default_factory=list)
+    disturbances: list[systems.DisturbanceForce] = field(default_factory=list)
 
     carries: ClassVar[bool] = False
     """Whether the plant has these itself. Else a model has the payloads and disturbances, and
@@ -78,11 +70,11 @@ class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
 
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
-        return RobotPlant(model, structure=structure)
+        return systems.RobotPlant(model, structure=structure)
 
 
 @dataclass(frozen=True)
-class MultibodyPlant(ContactMaterial, ScenarioPlant):
+class MultibodyPlant(systems.ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
     A ball at the tool touches the surfaces of the constraints. With point contact the force is
@@ -94,7 +86,7 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
     carries: ClassVar[bool] = True
 
     @property
-    def material(self) -> ContactMaterial:
+    def material(self) -> systems.ContactMaterial:
         return self
 
     @property
@@ -109,7 +101,7 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
             read_robot(robot, plant, scene_graph, self.payloads)
 
         with at("plant or plant.parameters"):
-            return ContactPlant(
+            return systems.ContactPlant(
                 model,
                 add,
                 self,
@@ -136,11 +128,11 @@ class CompliantContact(PointMaterial, ScenarioPlant):
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:
-        cast(CompliantPlant, plant).set_contact(context, self)
+        cast(systems.CompliantPlant, plant).set_contact(context, self)
 
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         with at("plant or plant.parameters"):  # Whose numbers are set in a context.
-            return CompliantPlant(model, self, structure=structure)
+            return systems.CompliantPlant(model, self, structure=structure)
 
 
 @dataclass(frozen=True)
@@ -212,7 +204,7 @@ class Sensors:
         force: The measurement of the constraint force, in place of that of the law's model.
     """
 
-    encoders: Encoders | None = None
+    encoders: systems.Encoders | None = None
     force: MeasuredForce | None = None
 
     @property
@@ -376,7 +368,7 @@ class ScenarioTask:
             `law.gains` if left out.
     """
 
-    phases: Sequence[Phase]
+    phases: Sequence[systems.Phase]
     contact: str | Sequence[str] = ""
     contact_force: float = 0.5
     patience: float = 0.25
@@ -392,10 +384,10 @@ class ScenarioTask:
                 text = unknown_name("signal of a condition", name, signals)
                 raise ModelError(f"signals: {text}")
 
-    def make(self, force_noise: float = 0.0) -> Task:
+    def make(self, force_noise: float = 0.0) -> systems.Task:
         """The `Task` of these phases, for a standard deviation of the force sensor's noise in N."""
         limits = self.contact_force, self.patience, force_noise, self.tare_time, self.retries
-        return Task(tuple(self.phases), *limits)
+        return systems.Task(tuple(self.phases), *limits)
 
 
 @dataclass(frozen=True)

@@ -1,25 +1,92 @@
-"""The results of a sweep, as a table, a plot, and in words."""
+"""The results of a sweep: its runs' outcomes and figures, as a table, a plot, and in words."""
 
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from drake_dae.analysis import Part, Table, count_of, to_text
+from drake_dae.analysis import LimitKind, Part, SignalRange, Table, count_of, to_text
 from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
-from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.running.judgement import late_rms
 from drake_dae.studies.variations import Variation
 
 FILES = ("runs.csv", "runs.png")  # The files that `Study.save` writes.
 MOST_REASONS = 5  # The most unfinished runs that are listed with their reasons.
 MOST_AXES = 24  # The most figures in the plot.
+
+
+class Outcome(StrEnum):
+    """How a run of a sweep ended."""
+
+    FINISHED = "finished"
+    FAILED = "failed"  # Before its end; the figures are those up to the failure.
+    NO_START = "no start"  # There is no consistent initial state.
+    REFUSED = "refused"  # The scenario contradicts itself, or violates an assumption.
+    CRASHED = "crashed"  # The process ended, or raised an unexpected error.
+    TIMED_OUT = "timed out"
+
+    @property
+    def is_final(self) -> bool:
+        """Whether another attempt would have the same outcome."""
+        return self not in (Outcome.CRASHED, Outcome.TIMED_OUT)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """How a run of a sweep ended and why, its figures, and the signals beyond their limits."""
+
+    outcome: Outcome
+    reason: str = ""
+    figures: Mapping[str, float] = field(default_factory=dict)
+    exceeded: tuple[str, ...] = ()
+
+
+def figures_of(record: Record, ranges: Sequence[SignalRange]) -> dict[str, float]:
+    """The figures of a run: name with unit, such as "largest error of tool.z [m]" -> number.
+
+    For each output: the largest |z - r|, the last z - r, and the "late" error, the root mean square
+    of z - r over the second half of the time. For each constraint force: its least and largest
+    value. For each control: the largest |u|. Then the "margin" of each limited signal, its least
+    distance from its limits, which is negative beyond them; the largest constraint residual before
+    a projection, and the time at which the record ends. An empty record has none.
+    """
+    figures = dict[str, float]()
+
+    def add(what: str, signal: Signal, value: float) -> None:
+        figures[f"{what} {signal.name}" + (f" [{signal.unit}]" if signal.unit else "")] = value
+
+    if not record.time.size:
+        return figures
+    errors = record.signals["tracking_error"]
+    late = late_rms(record.time, errors.values) if errors.signals else ()
+    for signal, column, rms in zip(errors.signals, errors.values.T, late, strict=True):
+        add("largest error of", signal, float(np.max(np.abs(column))))
+        add("final error of", signal, float(column[-1]))
+        add("late error of", signal, float(rms))
+    forces, controls = (record.signals[name] for name in ("constraint_force", "control"))
+    for signal, column in zip(forces.signals, forces.values.T, strict=True):
+        add("least", signal, float(np.min(column)))
+        add("largest", signal, float(np.max(column)))
+    for signal, column in zip(controls.signals, controls.values.T, strict=True):
+        add("largest", signal, float(np.max(np.abs(column))))
+    for r in ranges:
+        # The margin of a force that may not pull is its least value.
+        if isfinite(r.room) and r.kind is not LimitKind.FORCE:
+            add("margin of", r.signal, r.room)
+    figures["largest residual"] = float(np.abs(record["constraint_residual"]).max(initial=0.0))
+    figures["end [s]"] = float(record.time[-1])
+    return figures
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +112,11 @@ class Study:
             counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
             parts.append([f"beyond their limits: {', '.join(counted)}"])
         rows = []
-        for figure, extent in self.extent().items():
+        for figure in self.figures:
             values = self.values(figure)
             least, largest = str(np.nanargmin(values)), str(np.nanargmax(values))
-            low, median, high = (f"{number:.4g}" for number in extent.values())
+            extent = np.nanmin(values), np.nanmedian(values), np.nanmax(values)
+            low, median, high = (f"{number:.4g}" for number in extent)
             rows.append([figure, low, least, median, high, largest])
         head = ["figure", "least", "at run", "median", "largest", "at run"]
         return to_text([*parts, Table(head, rows)] if rows else parts)

@@ -3,8 +3,10 @@
 import json
 import multiprocessing.context
 import os
+import re
 import sqlite3
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -15,26 +17,40 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from threading import RLock
+from threading import Lock, RLock
 from types import ModuleType
 from typing import Any
 
 from pebble import ProcessExpired, ProcessFuture, ProcessPool
+from pydrake.systems.framework import Context
 from tqdm import tqdm
 
+from drake_dae.analysis import SignalLimits, robot_limits
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief, check_whole_number, positive
 from drake_dae.blocks.machine import num_cores
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record
+from drake_dae.errors import (
+    AssumptionError,
+    DrakeDaeError,
+    InconsistentStateError,
+    ModelError,
+    ScenarioError,
+    SimulationError,
+)
 from drake_dae.running.interruption import end_at_once, ending_signals
-from drake_dae.running.simulate import default_size
-from drake_dae.scenario.build import for_rollout
+from drake_dae.running.rollout_program import program_of
+from drake_dae.running.simulate import default_size, simulate
+from drake_dae.scenario.build import build_completed, for_rollout, roll_scenario
 from drake_dae.scenario.model import complete_scenario
+from drake_dae.scenario.parts import Matrices
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data, varied_data
-from drake_dae.studies.runs import Outcome, Runner, RunResult, run_one, structure_of
-from drake_dae.studies.study import Study
+from drake_dae.scenario.start import start_scenario
+from drake_dae.studies.study import Outcome, RunResult, Study, figures_of
 from drake_dae.studies.variations import Variation, plain
 
 # The largest number of variations whose keys and values are checked before the first run.
@@ -111,7 +127,16 @@ def sweep(
     path, settings = Path(file), json.dumps([base, lasting])
     with ending_signals(end_at_once):
         if not os.path.lexists(path):
-            _try(Runner(base, lasting), chosen)
+            runner, errors = Runner(base, lasting), list[ScenarioError]()
+            # The first, the middle or the last run can be built.
+            for index in dict.fromkeys((0, len(chosen) // 2, len(chosen) - 1)):
+                try:
+                    runner.check(chosen[index])
+                    break
+                except ScenarioError as error:
+                    errors.append(error)
+            else:
+                raise errors[0]
         with open_journal(path, head) as journal:
             # Runs of one structure follow each other, so that a process keeps its loop.
             order = sorted(range(len(chosen)), key=structures.__getitem__)
@@ -229,17 +254,6 @@ def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
         raise ScenarioError(*problems)
 
 
-def _try(runner: Runner, variations: Sequence[Variation]) -> None:
-    """Checks that the first, the middle or the last run can be built."""
-    errors = []
-    for index in dict.fromkeys((0, len(variations) // 2, len(variations) - 1)):
-        try:
-            return runner.check(variations[index])
-        except ScenarioError as error:
-            errors.append(error)
-    raise errors[0]
-
-
 _TABLES = """
 CREATE TABLE IF NOT EXISTS sweep (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS runs (
@@ -287,10 +301,7 @@ class Journal:
 
 @contextmanager
 def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
-    """Creates the file of a sweep with missing folders, or opens it to continue.
-
-    `head` says what the sweep is, name -> text; equal sweeps have equal ones.
-    """
+    """Creates the file of a sweep with missing folders, or opens that with an equal `head`."""
     unusable = f"cannot use {brief(str(path))} as the file of a sweep: "
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -317,3 +328,147 @@ def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
             yield Journal(database)
         except sqlite3.Error as error:
             raise ModelError(f"{unusable}{error}") from None
+
+
+# Keys whose values are set in a context, for any scenario.
+_OF_A_RUN = (
+    r"description|duration|judgement\.may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?|"
+    r"sensors\.(encoders\.seed|force\.(seed|bias|drift))"
+)
+
+
+def structure_of(variation: Variation, base: Scenario) -> Variation:
+    """The part of a variation of the sweep's scenario that the closed loop depends on.
+
+    The other values are set in a context, so that runs with the same part share one loop: start,
+    duration and integrator, parameters of the plant, gains that couple no outputs, seeds.
+    """
+    plant = base.plant
+    patterns = [_OF_A_RUN, *(rf"start\.positions\.{re.escape(q)}" for q in base.start.positions)]
+    if not base.is_advised:
+        patterns += [rf"plant\.{re.escape(name)}" for name in plant.in_context]
+    elif "friction" in plant.in_context:  # No gains are computed from it.
+        patterns.append(r"plant\.friction")
+    if not plant.carries:
+        patterns.append(r"plant\.parameters(\..+)?")
+    if plant.adjusts and not plant.carries:
+        patterns.append(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
+    if not (isinstance(base.law.gains, Matrices) or base.is_advised or base.task is not None):
+        patterns.append(r"law\.gains\..+")
+        if base.sensors.force_noise:
+            patterns.append(r"sensors\.force\.noise_deviation")
+    in_context = re.compile("|".join(patterns))
+    own = {key: value for key, value in variation.items() if not in_context.fullmatch(key)}
+    # Another kind of plant may set other values in a context.
+    of_kind = re.compile(r"plant(\.(?!parameters|payloads|disturbances)|$)")
+    return variation if any(map(of_kind.match, own)) else own
+
+
+class Runner:
+    """Makes runs of a sweep, and keeps the closed loop as long as the structure is the same.
+
+    `lasting`: the simulated time of all runs with one loop, in s, for rollouts.
+    """
+
+    def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
+        self._base, self._lasting, self.builds = base, lasting, 0
+        self._scenario = self._read({})
+        self._structure: Variation | None = None
+        self._loop: ClosedLoop | DrakeDaeError | None = None
+
+    def run(self, variation: Variation) -> RunResult:
+        """The result of a run, whatever happens in it."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # Each run would report the same.
+                scenario, loop = self._built(variation)
+                try:
+                    context = start_scenario(scenario, loop)
+                    record, steps, failure = self._simulated(scenario, loop, context)
+                except DrakeDaeError as error:
+                    outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
+                    return RunResult(outcome, str(error))
+        except DrakeDaeError as error:
+            return RunResult(Outcome.REFUSED, str(error))
+        except Exception as error:  # A sweep of thousands of runs goes on.
+            return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
+        limits = _limits(loop)
+        ranges = limits.ranges(record.time, limits.of_record(record))
+        figures = figures_of(record, ranges)
+        exceeded = tuple(r.signal.name for r in ranges if r.excess)
+        if failure is not None:
+            return RunResult(Outcome.FAILED, str(failure), figures, exceeded)
+        return RunResult(Outcome.FINISHED, "", {**figures, "steps": float(steps)}, exceeded)
+
+    def check(self, variation: Variation) -> None:
+        """Checks keys and values of a variation; that it starts is no question here."""
+        try:
+            scenario, loop = self._built(variation)
+            if self._lasting is not None:
+                program_of(loop)
+            start_scenario(scenario, loop)
+        except ModelError as error:
+            raise ScenarioError(("", str(error))) from error
+        except DrakeDaeError as error:
+            if isinstance(error, ScenarioError) and not _is_about_states(error):
+                raise
+
+    def _read(self, variation: Variation) -> Scenario:
+        scenario = read_scenario(varied_data(self._base, variation))
+        return scenario if self._lasting is None else for_rollout(scenario)[0]
+
+    def _built(self, variation: Variation) -> tuple[Scenario, ClosedLoop]:
+        """The scenario of a run and its closed loop, which is built if the structure changed."""
+        scenario, structure = self._read(variation), structure_of(variation, self._scenario)
+        if structure != self._structure or self._loop is None:
+            self._structure, self._loop = structure, None
+            self.builds += 1
+            try:
+                self._loop = build_completed(self._read(structure))[1]
+            except DrakeDaeError as error:
+                self._loop = error
+        if isinstance(self._loop, DrakeDaeError):
+            raise self._loop
+        return scenario, self._loop
+
+    def _simulated(
+        self, scenario: Scenario, loop: ClosedLoop, context: Context
+    ) -> tuple[Record, int, SimulationError | None]:
+        """The record, the number of steps, and the failure if any."""
+        if self._lasting is not None:
+            rollout = roll_scenario(scenario, loop, context, self._lasting)
+            return rollout.record, rollout.steps, rollout.failure
+        steps, failure, may = 0, None, scenario.judgement.may_diverge
+        given = scenario.duration, scenario.integrator
+        try:
+            run = simulate(loop.diagram, context, *given, may_diverge=may)
+            steps = run.steps
+            if run.interrupted:
+                raise KeyboardInterrupt(run.interrupted)
+        except SimulationError as error:
+            failure = error
+        return loop.record(context), steps, failure
+
+
+@lru_cache(maxsize=1)
+def _limits(loop: ClosedLoop) -> SignalLimits:
+    return robot_limits(loop.plant.robot("a sweep"))
+
+
+def _is_about_states(error: BaseException | None) -> bool:
+    """Whether an error is about states or assumptions, and not about keys of the scenario."""
+    while error is not None:
+        if isinstance(error, (AssumptionError, InconsistentStateError, SimulationError)):
+            return True
+        error = error.__cause__
+    return False
+
+
+_runner = lru_cache(maxsize=1)(lambda settings: Runner(*json.loads(settings)))
+_ALONE = Lock()
+
+
+def run_one(settings: str, variation: Variation) -> RunResult:
+    """Makes one run, in whatever process or thread; the settings are those of `Runner` as JSON."""
+    with _ALONE:  # The threads of a process share its loop.
+        return _runner(settings).run(variation)

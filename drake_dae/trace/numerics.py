@@ -88,8 +88,10 @@ def are_dependent(gradients: FloatArray) -> bool:
 
 
 def smallest_singular_value(matrix: FloatArray) -> float:
-    """Returns the smallest singular value of a matrix with no more rows than columns."""
-    return float(np.linalg.svd(matrix, compute_uv=False)[-1])
+    """Returns the smallest singular value: infinity if there is none, nan if one is not finite."""
+    if not np.isfinite(matrix).all():
+        return np.nan
+    return float(np.min(np.linalg.svd(matrix, compute_uv=False), initial=np.inf))
 
 
 def equilibrated(matrix: FloatArray) -> FloatArray:
@@ -129,7 +131,6 @@ class NewtonModel(NamedTuple):
 
     step: Callable[[FloatArray], FloatArray]
     is_regular: bool
-    measure: Callable[[FloatArray], float] | None = None
 
 
 @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
@@ -154,23 +155,19 @@ def newton(
         linearization = linearize(x)
         if linearization is None:
             return x, False
-        step_from, regular, measure = linearization
+        step_from, regular = linearization
         step = step_from(x)
         size = length_of(step)
         if size <= ROUNDING:
             return polished(x, step, step_from), regular
-        value = size if measure is None else measure(x)
         for length in LENGTHS:
             trial = x + (step if length == 1.0 else length * step)
-            if measure is None:
-                following = step_from(trial)
-                left = length_of(following)
-                if left * left <= PRECISION * size:
-                    # The next step would be left / size times as long.
-                    return polished(trial, following, step_from), regular
-            else:
-                left = measure(trial)
-            if left <= (1.0 - 0.25 * length) * value:
+            following = step_from(trial)
+            left = length_of(following)
+            if left * left <= PRECISION * size:
+                # The next step would be left / size times as long.
+                return polished(trial, following, step_from), regular
+            if left <= (1.0 - 0.25 * length) * size:
                 break
         else:
             return x, regular and bool(size <= CONVERGED)

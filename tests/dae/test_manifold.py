@@ -99,7 +99,7 @@ def test_failures_say_what_is_left_and_why():
     with pytest.raises(InconsistentStateError, match="y0 = 1") as caught:
         manifold_of(lambda x: x[0] ** 2 + 1).project([0.3, 0.0])
     assert caught.value.residual == pytest.approx([1.0], abs=0.01)
-    with pytest.raises(InconsistentStateError, match="y0"):
+    with pytest.raises(InconsistentStateError, match=r"y[01] = -?0\.5 "):
         manifold_of(lambda x: [x[0] - 1, x[0] - 2]).project([0.0, 0.0])
     with pytest.raises(InconsistentStateError, match="y0"):
         manifold_of(lambda x: ca.sqrt(x[0]) - 1).project([-1.0, 0.0])

@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from problems import redundant, system_of
 from problems.made_up import TABLE, plate
+from scipy.spatial.transform import Rotation
 
 from drake_dae import DaePlant, DaeSystem, drop_constraints, find_structure, share_forces
 from drake_dae.errors import AssumptionError, ModelError
@@ -30,6 +31,29 @@ def test_a_table_with_four_legs_stands_on_three(names):
     np.testing.assert_allclose(jacobian.T @ force, [9.81 * 4.0, -0.3, 0.2], rtol=1e-12)
     rates = plant.EvalTimeDerivatives(context).CopyToVector()
     np.testing.assert_allclose(rates, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [[0.3, -0.7, 0.4], [1.1, 0.2, -0.5]])
+def test_a_planar_linkage_in_an_oblique_plane(turn):
+    """A four-bar closed by a pin in space: its rows across the plane hold round-off alone."""
+    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
+    angles = ca.vertcat(q[0], q[0] + q[1], q[0] + q[1] + q[2])
+    lengths = ca.DM([0.3, 0.8, 0.5])
+    axes = ca.SX(Rotation.from_rotvec(turn).as_matrix())
+    tip = ca.vertcat(ca.dot(lengths, ca.cos(angles)) - 0.7, ca.dot(lengths, ca.sin(angles)), 0)
+    rod = ca.vertcat(ca.cos(angles[2]), ca.sin(angles[2]), 0)
+    k = ca.vertcat(ca.mtimes(axes, tip), ca.dot(ca.mtimes(axes, rod), axes[:, 2]))
+    system = DaeSystem(
+        state=ca.vertcat(q, v),
+        f=ca.vertcat(v, ca.SX(3, 1)),
+        g=ca.vertcat(ca.SX(3, 4), ca.jacobian(k, q).T),
+        h=ca.SX(6, 0),
+        k=k,
+        l=ca.SX(0, 1),
+        m=ca.SX(0, 4),
+        nominal_state=[1.2, -0.9, -1.9, 0.0, 0.0, 0.0],
+    )
+    assert drop_constraints(system).num_constraints == 2
 
 
 def test_what_cannot_go_is_refused():

@@ -78,16 +78,19 @@ BASE, LENGTH, RADIUS, JOINTS = 0.3, 0.5, 0.06, 4
 TABLE = Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
 
 
-def urdf(shape):
-    """Links of 0.5 m that turn about y and point along x at zero, each with a shape at its end."""
+def urdf(shape, joints):
+    """Links of 0.5 m that turn about y and point along x at zero, each with a shape at its end.
+
+    Four are a chain; a fifth stands on the base.
+    """
     inertia = '<mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>'
     parts = ['<robot name="chain"><link name="base"/>']
     parts.append(
         '<joint name="mount" type="fixed"><parent link="world"/><child link="base"/>'
         f'<origin xyz="0 0 {BASE}"/></joint>'
     )
-    for index in range(JOINTS):
-        above, shift = (f"link{index - 1}", LENGTH) if index else ("base", 0.0)
+    for index in range(joints):
+        above, shift = (f"link{index - 1}", LENGTH) if index % 4 else ("base", 0.0)
         parts.append(
             f'<link name="link{index}"><inertial><origin xyz="0.25 0 0"/>{inertia}</inertial>'
             f'<collision><origin xyz="{LENGTH} 0 0"/><geometry>{shape}</geometry></collision>'
@@ -101,15 +104,15 @@ def urdf(shape):
     return "".join(parts)
 
 
-def chain(surface, shape=f'<sphere radius="{RADIUS}"/>'):
+def chain(surface, shape=f'<sphere radius="{RADIUS}"/>', joints=JOINTS):
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    Parser(plant).AddModelsFromString(urdf(shape), "urdf")
+    Parser(plant).AddModelsFromString(urdf(shape, joints), "urdf")
     plant.Finalize()
     return RobotModel(
         MultibodyExpressions(plant, scene_graph),
         [PointOnSurface("tip", surface, name="wall")],
-        [JointPositions(["joint1", "joint2", "joint3"])],
+        [JointPositions([f"joint{k}" for k in range(1, joints)])],
         plant.GetDefaultPositions(),
         "chain",
     )
@@ -123,7 +126,7 @@ def ends(q):
 
 
 def behind(model, *configurations):
-    states = np.column_stack([configurations, np.zeros((len(configurations), JOINTS))])
+    states = np.column_stack([configurations, np.zeros_like(configurations)])
     own = np.tile(model.dae.parameter_values, (len(states), 1))
     return links_behind(model, np.arange(len(states)) / 10.0, states, own)
 
@@ -141,6 +144,13 @@ def test_an_elbow_above_a_table_is_no_problem_and_one_in_it_is_named():
     (one,) = behind(model, bent(0.07), bent(0.03), bent(0.02), bent(0.07))
     assert (one.link, one.time) == ("link1", 0.2)
     assert one.depth == pytest.approx(RADIUS - 0.02, abs=1e-9)
+
+
+def test_a_link_beside_the_one_in_contact_is_named():
+    """The last link of the robot, on the base: it ends next to the contact, and below the table."""
+    (one,) = behind(chain(TABLE, joints=5), [-1.0, 1.0, 1.2, 1.4, 0.55])
+    depth = RADIUS - (BASE - LENGTH * np.sin(0.55))
+    assert (one.link, one.depth) == ("link4", pytest.approx(depth, rel=1e-9))
 
 
 @pytest.mark.parametrize(

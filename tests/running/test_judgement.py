@@ -8,7 +8,7 @@ import pytest
 from drake_dae import Record, Signal
 from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
-from drake_dae.running.judgement import FindingKind, Judgement, Outcome, late_rms
+from drake_dae.running.judgement import FindingKind, Outcome, RunSummary, late_rms
 from drake_dae.systems.controller import PhaseChange
 
 TIMES = np.linspace(0.0, 10.0, 1001)
@@ -42,7 +42,7 @@ PUSHES = (force_range(),)
 def judged(record, predicted=None, ranges=PUSHES, reasons=("a reason",), **options):
     if predicted is None:
         predicted = np.zeros_like(record["tracking_error"])
-    return Judgement(record, predicted, ranges, reasons=reasons, **options)
+    return RunSummary(record, predicted, ranges, reasons=reasons, **options)
 
 
 def decaying(rate):
@@ -197,7 +197,7 @@ def test_a_run_without_outputs():
     empty = Recorded(np.zeros((TIMES.size, 0)), ())
     names = ("desired_output", "tracking_error", "constraint_force")
     record = Record(TIMES, dict.fromkeys(names, empty))
-    assert Judgement(record, np.zeros((TIMES.size, 0))).outcome is Outcome.GOOD
+    assert RunSummary(record, np.zeros((TIMES.size, 0))).outcome is Outcome.GOOD
 
 
 def test_the_late_size_of_a_straight_line():

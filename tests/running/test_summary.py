@@ -8,8 +8,8 @@ import pytest
 from drake_dae import Record, Signal
 from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
-from drake_dae.running.simulate import RunStatistics
-from drake_dae.running.summary import RunSummary, figures_of
+from drake_dae.running.judgement import RunStatistics, RunSummary
+from drake_dae.studies.study import figures_of
 
 OUTPUTS = [("tool.z", "m"), ("axis.y", "")]
 PREDICTED = np.array([[0.05, 0.0], [-0.0625, 0.0], [0.00125, 0.0]])

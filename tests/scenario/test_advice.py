@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import numbers
-from runs import scenario
+from runs import scenario, scenario_model
 
 from drake_dae import build_scenario, contact_gains, load_scenario, simulate
 from drake_dae.dae import Parameter, advised_gains
@@ -19,12 +19,12 @@ from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.gains import (
     advised,
     estimates_all,
+    estimating_all,
     sensed_contact,
     stated_errors,
-    with_all_estimated,
 )
 from drake_dae.scenario.judging import find_feasibility, judge_run
-from drake_dae.scenario.model import scenario_model, scenario_structure
+from drake_dae.scenario.model import scenario_structure
 from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.start import start_scenario
 
@@ -117,9 +117,9 @@ def test_ranges_end_where_a_parameter_has_no_meaning():
 
 def test_what_cannot_be_estimated_refuses_no_run(monkeypatch):
     def impossible(scenario, model):
-        return replace(with_all_estimated(scenario, model), bounds={"tool_load.mass": (2.0, 3.0)})
+        return replace(estimating_all(scenario, model), bounds={"tool_load.mass": (2.0, 3.0)})
 
-    monkeypatch.setattr(build, "with_all_estimated", impossible)
+    monkeypatch.setattr(build, "estimating_all", impossible)
     completed, loop = build_completed(two_link("constraints.0.friction=0.0"))
     assert any("tool_load.mass" in note for note in completed.notes)
     assert loop.observer.friction_signals[0].name == "wall.friction"

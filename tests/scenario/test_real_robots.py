@@ -24,8 +24,7 @@ ROBOTS = {
     "so100": "so_arm_description/urdf/so100.urdf",
 }
 
-# Kinova gives one colour's name two colours, tiago antennas that no inertia can be of; collisions
-# are in .dae or .stl.
+# Tiago's antennas have inertias that no body has; collisions are in .dae or .stl.
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning"),

@@ -5,7 +5,7 @@ import resource
 import pytest
 
 from drake_dae.errors import ModelError
-from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.studies.study import Outcome, RunResult
 from drake_dae.studies.sweep import open_journal
 
 HEAD = {"version": "1.0", "duration": "1.0", "variations": "[1, 2, 3]"}

@@ -7,11 +7,11 @@ from runs import run_scenario, scenario, some
 from drake_dae import build_scenario
 from drake_dae.analysis import robot_limits
 from drake_dae.errors import ScenarioError
-from drake_dae.running.summary import figures_of
 from drake_dae.scenario.build import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
 from drake_dae.scenario.start import start_scenario
-from drake_dae.studies.runs import Outcome, Runner, structure_of
+from drake_dae.studies.study import Outcome, figures_of
+from drake_dae.studies.sweep import Runner, structure_of
 
 SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
 

@@ -19,8 +19,7 @@ from runs import scenario, some
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.studies import Study, make_variations
-from drake_dae.studies.runs import Outcome, RunResult
-from drake_dae.studies.study import FILES
+from drake_dae.studies.study import FILES, Outcome, RunResult
 
 KEYS = {
     "start.errors.tool.z": np.linspace(-0.05, 0.05, 5),

@@ -27,7 +27,7 @@ from drake_dae import (
 )
 from drake_dae.diagrams import LoopSettings, wire_loop
 from drake_dae.robots import KnownForce
-from drake_dae.running.simulate import RunStatistics
+from drake_dae.running.judgement import RunStatistics
 from drake_dae.systems import PointMaterial, open_contact
 from drake_dae.systems.phases import Phase
 

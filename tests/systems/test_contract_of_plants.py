@@ -18,7 +18,7 @@ from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.studies.runs import Outcome
+from drake_dae.studies.study import Outcome
 from drake_dae.systems import PointMaterial
 from drake_dae.systems.plant import Plant
 

@@ -294,11 +294,11 @@ def test_steps_are_the_shortest():
         random.normal(size=3),
         random.normal(size=6),
     )
-    step, regular, _ = shortest_steps(gradients, lambda at: residual)
+    step, regular = shortest_steps(gradients, lambda at: residual)
     assert regular
     expected = -np.linalg.pinv(gradients) @ residual
     # Numbers of order 1, well conditioned.
     np.testing.assert_allclose(step(x), expected, atol=1e-14)
-    step, regular, _ = shortest_steps(np.zeros((0, 6)), lambda at: np.zeros(0))
+    step, regular = shortest_steps(np.zeros((0, 6)), lambda at: np.zeros(0))
     np.testing.assert_array_equal(step(x), np.zeros(6))
     assert regular

@@ -478,26 +478,23 @@ def _collides(geom: Element) -> bool:
 def _fault_of_geom(geom: Element) -> str:
     """Why Drake takes no such shape of MJCF; "" if it does, or if it is a mesh."""
     kind = "mesh" if "mesh" in geom.attrib else geom.get("type", "sphere")
-    if kind in ("mesh", "plane"):
-        return ""
     if kind not in _SIZES:
-        return _UNREAD
+        return "" if kind == "plane" else _UNREAD
     sizes = [number_in(word) or 0.0 for word in geom.get("size", "").split()]
-    ends = geom.get("fromto", "").split()
-    count = 1 if ends else sum(_SIZES[kind].values()) or 3
-    is_empty = len(sizes) < count or min(sizes[:count]) <= 0.0
-    return _EMPTY if is_empty or (ends and ends[:3] == ends[3:]) else ""
+    ends, count = geom.get("fromto", "").split(), sum(_SIZES[kind].values())
+    count = min(count, 1) if ends else 3 if kind == "ellipsoid" else count
+    is_full = len(sizes) >= count and all(size > 0.0 for size in sizes[:count])
+    return "" if is_full and (not ends or ends[:3] != ends[3:]) else _EMPTY
 
 
 def _fault(form: Element, kind: str) -> str:
     """Why Drake takes no such shape of URDF or SDFormat; "" if it does."""
     sizes = _SIZES.get(form.tag.removeprefix("drake:"))
-    if sizes is None and not (kind == ".sdf" and form.tag in ("plane", "empty")):
-        return _UNREAD
+    if sizes is None:
+        return "" if kind == ".sdf" and form.tag in ("plane", "empty") else _UNREAD
     for key in ("size", "radius", "length", "radii", "a", "b", "c", "scale"):
         words = (form.get(key) or form.findtext(key) or "").split()
-        count = (sizes or {}).get(key, len(words))
-        if len(words) != count and (words or kind == ".urdf"):
+        if len(words) != sizes.get(key, len(words)) and (words or kind == ".urdf"):
             return _UNREAD
         numbers = [number_in(word) or 0.0 for word in words]
         if any(abs(number) <= _FLAT if key == "scale" else number <= 0.0 for number in numbers):

@@ -75,22 +75,10 @@ _Leaders = Mapping[JointIndex, tuple[JointIndex, float, float]]
 _REMEDIES = {
     "friction": "robot.known_forces has friction as a !JointFriction",
     "mimic": "constraints has joints that move together as a !JointCoupler",
-    "equality/joint": "constraints has joints that move together as a !JointCoupler",
-    "equality/weld": "constraints has it as a !WeldedFrames",
-    "equality/connect": "constraints has it as a !CoincidentPoints",
+    "equality/": "constraints has it as a !JointCoupler, !WeldedFrames or !CoincidentPoints",
     "inertia": "it takes the nearest possible moments of inertia",
 } | dict.fromkeys(DRIVES, "or name the driven joints under robot.actuators")
 """What the name of a lost part contains -> what to do besides."""
-
-_ROLL_PITCH_YAW = (
-    "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place of a "
-    "quaternion, whose length no force keeps at 1, and must not pitch by 90 degrees"
-)
-
-_RED = [0.8, 0.1, 0.1, 1.0]
-
-_MASSLESS = 1e-12
-"""An eigenvalue of M(q) below this fraction of the largest one is zero up to round-off."""
 
 
 @at("robot.file")
@@ -126,7 +114,7 @@ def _check_mass(plant: MultibodyPlant) -> None:
     step = np.random.default_rng(0).uniform(-1.0, 1.0, plant.num_positions())
     plant.SetPositions(context, plant.GetPositions(context) + step)
     values, modes = np.linalg.eigh(plant.CalcMassMatrix(context))
-    null = modes[:, values <= _MASSLESS * np.max(values, initial=0.0)]
+    null = modes[:, values <= 1e-12 * np.max(values, initial=0.0)]  # Zero up to round-off.
     massless = {
         name: joint.child_body().name()
         for name, joint in joint_names(plant).items()
@@ -134,13 +122,10 @@ def _check_mass(plant: MultibodyPlant) -> None:
     }
     if massless:
         raise ModelError(
-            f"joints that move no mass: {', '.join(massless)}. Links without it, which no force "
-            f"can move: {', '.join(massless.values())}; give them <inertial> with mass and "
-            "inertia, or lock the joints by robot.locked"
+            f"joints that move no mass: {', '.join(massless)}; give their links "
+            f"({', '.join(massless.values())}) an <inertial> with mass and inertia, or lock the "
+            "joints by robot.locked"
         )
-
-
-# From files to a plant.
 
 
 def read_robot(
@@ -172,13 +157,17 @@ def read_robot(
             body = frame_named(plant, _scoped(model, name or "world")).body()
             for axis in range(3):
                 bar = Box(*np.where(np.arange(3) == axis, 0.06, 0.004))
-                plant.RegisterVisualGeometry(body, RigidTransform(), bar, f"left_out_{axis}", _RED)
+                plant.RegisterVisualGeometry(
+                    body, RigidTransform(), bar, f"left_out_{axis}", [0.8, 0.1, 0.1, 1.0]
+                )
         for model, name, child, origin in mender.floating:
             link = frame_named(plant, _scoped(model, child))
             start = plant.GetDefaultFloatingBaseBodyPose(link.body())
             joint = RpyFloatingJoint(name, frame_named(plant, _scoped(model, origin)), link)
             plant.AddJoint(joint).SetDefaultPose(start)
-            mender.tell(_ROLL_PITCH_YAW, f"'{name}'")
+            text = "floating joints have roll, pitch and yaw in the place of a quaternion, whose"
+            text += " length no force keeps at 1, and must not pitch by 90 degrees"
+            mender.tell(text, f"'{name}'")
         for (category, kind), items in mender.told.items():
             warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
         facts = dict[JointIndex, Mapping[str, Any]]()
@@ -270,9 +259,6 @@ def _told(lost: Mapping[str, list[str]]) -> str:
 def _listed(items: Iterable[str]) -> str:
     every = list(dict.fromkeys(items))
     return ", ".join(every[:8]) + (f" and {len(every) - 8} more" if len(every) > 8 else "")
-
-
-# What a scenario changes.
 
 
 def joints_of(plant: MultibodyPlant) -> list[Joint]:
@@ -392,17 +378,15 @@ def _lock_joints(
         name = names[index]
         joint = _simple_joint(name, plant)
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-        slides = isinstance(joint, PrismaticJoint)
+        if isinstance(joint, PrismaticJoint):
+            unit, pose = "m", RigidTransform(value * joint.translation_axis())
+        else:
+            unit, pose = "rad", RigidTransform(AngleAxis(value, joint.revolute_axis()), np.zeros(3))
         if not low - 1e-9 <= value <= high + 1e-9:  # Round-off of a ratio puts nothing outside.
-            unit = "m" if slides else "rad"
             why = "" if name in locked else ", as the joint that it is coupled to has it,"
             raise ModelError(
                 f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
             )
-        if slides:
-            pose = RigidTransform(value * joint.translation_axis())
-        else:
-            pose = RigidTransform(AngleAxis(value, joint.revolute_axis()), np.zeros(3))
         frames = joint.frame_on_parent(), joint.frame_on_child()
         welds.append(WeldJoint(joint.name(), *frames, pose))
         # Python's joint must be gone before Drake's: a new one at its address is taken for it.
@@ -457,9 +441,6 @@ def _drive_joints(
         effort = known.get("effort") or np.inf if limits[name] is None else limits[name]
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
         actuator.set_default_rotor_inertia(known.get("armature", 0.0))
-
-
-# Loops.
 
 
 def _cut_loops(plant: MultibodyPlant, facts: _Facts) -> LoopMakers:

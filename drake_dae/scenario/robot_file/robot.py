@@ -1,9 +1,8 @@
 """The robot of a scenario: a file, those that it names, and changes of it.
 
-Packages are found as ROS finds them. Meshcat copies meshes, and the files that they name, into its
-HTML page. A model from an untrusted source could name any file of this machine, and the page would
-disclose it. So geometry is read from the model's folder and packages alone, and from folders that
-the user names.
+Meshcat copies meshes, and the files that they name, into its HTML page. A model from an untrusted
+source could name any file of this machine. So geometry is read from the model's folder and packages
+alone, and from folders that the user names.
 
 Drake's renderer draws .obj and .gltf; its Meshcat draws .dae as well. So a .dae becomes a .gltf,
 with its own colors and textures, and any other mesh an .obj, by the optional package trimesh.
@@ -224,7 +223,11 @@ class RobotFiles:
     def _folder_of(self, package: str, file: Path) -> Path | None:
         for above in file.resolve().parents if file.name else ():
             for folder in (above, above / package):
-                if _package_name(folder) == package:
+                try:
+                    name = read_xml(folder / "package.xml").findtext("name", "")
+                except ModelError:  # There is none.
+                    continue
+                if name.strip() == package:
                     return folder
         ros = PackageMap.MakeEmpty()
         if os.environ.get("ROS_PACKAGE_PATH"):
@@ -283,14 +286,6 @@ class RobotFiles:
         return True
 
 
-def _package_name(folder: Path) -> str:
-    """The name in a folder's package.xml; empty if there is none."""
-    try:
-        return (read_xml(folder / "package.xml").findtext("name") or "").strip()
-    except ModelError:
-        return ""
-
-
 def _references(file: Path) -> Iterator[str]:
     """All that may name a file in a mesh or a material: parsers permit more than the formats."""
     kind = file.suffix.lower()
@@ -327,17 +322,18 @@ def drawable(mesh: Path, kinds: tuple[str, ...]) -> Path | None:
         return mesh
     is_scene = mesh.suffix.lower() == ".dae" and ".gltf" in kinds
     try:
-        name, changed, size = check_file(mesh.resolve(), ModelError)
-        return _converted(Path(name), ".gltf" if is_scene else ".obj", changed, size)
+        return _converted(is_scene, *check_file(mesh.resolve(), ModelError))
     except ModelError:  # Meshcat draws a .dae.
         return mesh if is_scene else None
 
 
 @cache
-def _converted(mesh: Path, kind: str, changed: int, size: int) -> Path:
-    folder = Path(_folder().name).resolve()
-    copy = folder / str(len(list(folder.iterdir()))) / f"{mesh.stem}{kind}"
-    text = _gltf(mesh) if kind == ".gltf" else _obj(mesh)
+def _converted(is_scene: bool, name: str, changed: int, size: int) -> Path:
+    mesh, folder = Path(name), Path(_folder().name).resolve()
+    text = _gltf(mesh) if is_scene else _obj(mesh)
+    copy = (
+        folder / str(len(list(folder.iterdir()))) / f"{mesh.stem}{'.gltf' if is_scene else '.obj'}"
+    )
     copy.parent.mkdir()
     copy.write_bytes(text)
     return copy

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from arms import arm, tool_at_start
 from pydrake.multibody.tree import JacobianWrtVariable
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, scenario_model
 
 from drake_dae import (
     CircleReference,
@@ -20,7 +20,6 @@ from drake_dae import (
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import Touch
 from drake_dae.scenario import complete_scenario
-from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Postures, tool_axis
 from drake_dae.scenario.scenario import TiltFromNormalForm, save_scenario
@@ -117,24 +116,15 @@ def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_k
     assert critical == pytest.approx(along / abs(across), rel=1e-10)
 
 
-def refusal(open_):
-    with pytest.raises(ScenarioError) as caught:
-        build_scenario(open_)
-    return str(caught.value)
-
-
-@pytest.mark.slow
-def test_a_start_out_of_reach_is_reported_with_the_output_and_by_how_much():
-    """The arm reaches 1.5 m at most from its shoulder."""
-    message = refusal(left_out(references={"tool": ConstantReference([0.0, 3.0])}))
-    assert message.startswith("references: ")
-    assert "tool.z" in message
-    assert "3 m" in message
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        # The arm reaches 1.5 m at most from its shoulder.
+        pytest.param(
+            {"references": {"tool": ConstantReference([0.0, 3.0])}},
+            "references: .*tool.z comes to 1.* m, and not to 3 m",
+            marks=pytest.mark.slow,
+        ),
         ({"outputs": [PointCoordinates("tool", "y")]}, "references: missing: tool.y"),
         (
             {"references": {"tool": ConstantReference((0.0,) * 4), "wall.force": FORCE}},
@@ -145,7 +135,8 @@ def test_a_start_out_of_reach_is_reported_with_the_output_and_by_how_much():
     ],
 )
 def test_references_that_fit_no_completion_are_refused(changes, message):
-    assert refusal(left_out(**changes)).startswith(message)
+    with pytest.raises(ScenarioError, match=f"^{message}"):
+        build_scenario(left_out(**changes))
 
 
 def test_a_planar_arm_gets_the_direction_that_it_can_move_in():
@@ -164,8 +155,7 @@ def test_a_robot_that_is_only_simulated_gets_no_outputs():
     assert complete_scenario(still).scenario is still
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize("axis", ["x", "y", "z"])
+@pytest.mark.parametrize(("axis", "sign"), [("x", 1.0), ("y", -1.0), ("z", 1.0)])
 def test_a_tool_sticks_out_along_the_axis_that_leads_to_its_point(axis, sign):
     """From the last joint that moves, which is less than 1 m away from the frame."""
     links = arm("two_link").model.links

@@ -38,7 +38,7 @@ def reaching(folder, z, positions, kind="revolute"):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["revolute", "continuous"])
-@pytest.mark.parametrize("two", some([1e-4, -2e-4, 0.003, 2.7], first=1))
+@pytest.mark.parametrize("two", some([1e-4, 2.7], first=1))
 def test_a_start_near_a_singular_guess_stays_within_limits(kind, two, tmp_path):
     """From a straight arm Newton's method goes far, and turns joints often."""
     scenario = reaching(tmp_path, 0.4, f"{{two: {two}}}", kind)
