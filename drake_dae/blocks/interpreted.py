@@ -6,8 +6,8 @@ from math import ceil
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.failures import LEAST_PROGRESS, PACE_STEPS
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepFunctions, StepSettings
-from drake_dae.blocks.trials import LEAST_PROGRESS, PACE_STEPS
 from drake_dae.errors import InconsistentStateError
 
 

@@ -26,7 +26,13 @@ from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.expressions import result_of
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
-from drake_dae.trace.numerics import NewtonModel, newton, positive, shortest_steps
+from drake_dae.trace.numerics import (
+    NewtonModel,
+    newton,
+    positive,
+    shortest_steps,
+    smallest_singular_value,
+)
 
 # A or B counts as singular below this fraction of its usual margin, also if it is a single number.
 VANISHED = 1e-9
@@ -127,18 +133,11 @@ class PinnedOutputs:
     def least_margins(self) -> FloatArray:
         """The margins below which A and B are singular, by their largest at sampled states."""
         still, p = np.zeros(self.layout.reference_size), self.system.parameter_values
-        margins = [
-            [margin_of(as_matrix(value)) for value in self.motion.evaluate(x, still, p)[4:6]]
-            for x in self.structure.states
-        ]
+        margins = []
+        for x in self.structure.states:
+            A, B = map(as_matrix, self.motion.evaluate(x, still, p)[4:6])
+            margins.append([smallest_singular_value(A), smallest_singular_value(B)])
         return VANISHED * np.max(margins, axis=0)
-
-
-def margin_of(matrix: FloatArray) -> float:
-    """The smallest singular value; infinite if there is none, nan if an entry is not finite."""
-    if not np.isfinite(matrix).all():
-        return np.nan
-    return float(np.min(np.linalg.svd(matrix, compute_uv=False), initial=np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +201,7 @@ class PinnedSet:
         values = self.outputs.motion.evaluate(state, self.reference, self.parameters)
         rate, u, v, unrest = (value.copy() for value in values[:4])
         *matrices, pivot = (as_matrix(value) for value in values[4:])
-        margins = margin_of(matrices[0]), margin_of(matrices[1])
+        margins = smallest_singular_value(matrices[0]), smallest_singular_value(matrices[1])
         signs = [np.linalg.slogdet(each)[0] for each in matrices if len(each) == each.shape[1]]
         flaw = ""
         if np.isnan(margins).any():

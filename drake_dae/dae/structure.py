@@ -384,10 +384,8 @@ def _singular(
 
     @np.errstate(all="ignore")
     def is_regular(state: FloatArray, parameters: FloatArray) -> bool:
-        at = value(state, parameters)
-        if not np.all(np.isfinite(at)):
-            return False
-        return smallest_singular_value(equilibrated(at)) > system.least_margin
+        at = equilibrated(value(state, parameters))
+        return smallest_singular_value(at) > system.least_margin  # Also not where it is nan.
 
     if violation is not None:
         if any(is_regular(state, system.parameter_values) for state in states):

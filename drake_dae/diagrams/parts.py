@@ -209,10 +209,6 @@ def add_exogenous(
             f"the references of exogenous signals cover {size}, '{dae.name}' has {len(signals)}: "
             f"{', '.join(signal.name for signal in signals) or 'none'}"
         )
-    if any(reference.parameters for reference in exogenous):
-        raise WiringError(
-            "references of exogenous signals take no parameters: write numbers into the expressions"
-        )
     degrees = block.exogenous_layout.degrees
     generator = ReferenceGenerator(exogenous, degrees)
     if depth:

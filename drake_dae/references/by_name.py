@@ -7,7 +7,6 @@ that order, "tool.yz"; or a list of such names, "tool.y, joint3".
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -41,13 +40,6 @@ class ReferenceRows(Reference):
     @property
     def repeats(self) -> float | None:
         return self.reference.repeats
-
-    @property
-    def parameters(self) -> Mapping[str, Any]:  # type: ignore[override]
-        return self.reference.parameters
-
-    def with_parameters(self, values: Mapping[str, Any]) -> Reference:
-        return ReferenceRows(self.reference.with_parameters(values), self.rows)
 
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
         needed, places = self._of_all_rows(degrees)

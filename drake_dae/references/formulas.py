@@ -1,10 +1,8 @@
 """References that are expressions of time: constants, sinusoids, moves, and any other."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import comb
-from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -12,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import vector
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references.reference import (
     FormulaReference,
@@ -141,57 +138,35 @@ class PointToPointReference(FormulaReference):
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class ExpressionReference(FormulaReference):
-    """A reference that is any CasADi expression of time, and of parameters by their names.
-
-    ExpressionReference(lambda t, height: height * casadi.sin(2 * t), {"height": 0.1}) has a
-    parameter, which stands in the context of the `ReferenceGenerator`: studies change it
-    without tracing again. References with a parameter of the same name share it.
+    """A reference that is any CasADi expression of time.
 
     Attributes:
-        function: Takes the time in s, a CasADi scalar, and each parameter by its name, a CasADi
-            column; returns an expression, or a list of these.
-        parameters: Name -> value, a number or shape (k,).
+        function: Takes the time in s, a CasADi scalar; returns an expression, or a list of these.
 
     Raises:
-        ReferenceSignalError: The function returns no such expression, or a parameter is no finite
-            number; or, when `derivatives` is called with mu_i >= 1, the expression has a constant
-            that is not finite, or an operation on time that is not smooth, such as fabs.
+        ReferenceSignalError: The function returns no such expression; or, when `derivatives` is
+            called with mu_i >= 1, the expression has a constant that is not finite, or an operation
+            on time that is not smooth, such as fabs.
     """
 
     function: Callable[..., Any]
-    parameters: Mapping[str, ArrayLike | ca.SX] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        parameters = {}
-        for name, value in self.parameters.items():
-            if not isinstance(value, ca.SX):
-                what = f"parameter '{name}'"
-                value = vector(what, np.atleast_1d(value), None, ReferenceSignalError)
-            parameters[name] = value
-        object.__setattr__(self, "parameters", MappingProxyType(parameters))
         time = ca.SX.sym("t")
         rows = self.rows(time)
-        symbols = ca.symvar(ca.vertcat(time, *(ca.SX(v) for v in parameters.values())))
-        allowed = {symbol.element_hash() for symbol in symbols}
-        unknown = [s.name() for s in ca.symvar(rows) if s.element_hash() not in allowed]
+        unknown = [s.name() for s in ca.symvar(rows) if s.element_hash() != time.element_hash()]
         if unknown or rows.shape[1] != 1:
             raise ReferenceSignalError(
-                "a reference must be a column of expressions of only the time and its parameters, "
-                f"got shape {rows.shape} with {', '.join(unknown) or 'no'} other symbols"
+                "a reference must be a column of expressions of only the time, got shape "
+                f"{rows.shape} with {', '.join(unknown) or 'no'} other symbols"
             )
 
     @property
     def size(self) -> int:
         return int(self.rows(ca.SX.sym("t")).numel())
 
-    def with_parameters(self, values: Mapping[str, ArrayLike | ca.SX]) -> "ExpressionReference":
-        changed = {name: values.get(name, value) for name, value in self.parameters.items()}
-        return ExpressionReference(self.function, changed)
-
     def rows(self, time: ca.SX) -> ca.SX:
-        symbols = {name: ca.SX(value) for name, value in self.parameters.items()}
-        function = partial(self.function, **symbols)
-        value = result_of("function", function, time, error=ReferenceSignalError)
+        value = result_of("function", self.function, time, error=ReferenceSignalError)
         try:
             return ca.SX(ca.vertcat(*(value if isinstance(value, (list, tuple)) else [value])))
         except (NotImplementedError, RuntimeError) as error:

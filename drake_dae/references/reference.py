@@ -1,10 +1,8 @@
 """The contract of a reference, and all references as one function of time."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from types import MappingProxyType
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -34,14 +32,9 @@ class Reference(ABC):
        with the row and a remedy. The function refuses a time without a value.
     6. `expression` has the same values at a symbolic time, so that all references are traced as
        one function; None if there is no such expression.
-    7. Numbers that a study changes in a context are `parameters`, and `with_parameters` is the same
-       reference with other values, or with symbols. Most references have none.
-    8. A reference with a file reads it when it is used. `remark` describes
-       approximations of the file's data.
+    7. A reference with a file reads it when it is used. `remark` describes approximations of the
+       file's data.
     """
-
-    parameters: Mapping[str, Any] = MappingProxyType({})
-    """Name -> values of the numbers that a study changes, each of shape (k,)."""
 
     @property
     @abstractmethod
@@ -70,10 +63,6 @@ class Reference(ABC):
             ReferenceSignalError: The reference is not smooth enough for these degrees.
         """
         return None
-
-    def with_parameters(self, values: Mapping[str, Any]) -> "Reference":
-        """Returns the same reference with other values of its parameters, or columns of symbols."""
-        return self
 
     @property
     def repeats(self) -> float | None:

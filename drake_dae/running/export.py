@@ -154,7 +154,7 @@ class Ticks:
 class ControllerPart:
     """The controller of a diagram with one `Plant`, and the ports of its inputs and outputs there.
 
-    It acts at once if the control has direct feedthrough from measurements; else updates change it.
+    It acts at once if the control has direct feedthrough from measurements.
     """
 
     def __init__(self, loop: ClosedLoop | Diagram, context: Context) -> None:

@@ -27,7 +27,7 @@ from pydrake.systems.primitives import VectorLogSink
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import stacked
 from drake_dae.blocks.compose import Composed, Leaves, Port, compose, leaf_port
-from drake_dae.blocks.primitives import symbolic_block
+from drake_dae.blocks.symbolic import symbolic_block
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.errors import DrakeDaeError
 from drake_dae.systems.plant import plants_in

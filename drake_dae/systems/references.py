@@ -1,6 +1,6 @@
 """References as a LeafSystem.                                                         (28)"""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -9,12 +9,10 @@ from math import factorial
 import casadi as ca
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import ArrayLike
-from pydrake.systems.framework import Context
 from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, all_finite, numbers, unknown_name
+from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, Block, BlockFunction, Requirement, stacked
 from drake_dae.blocks.failures import simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
@@ -39,13 +37,9 @@ class ReferenceGenerator(TracedSystem):
         references: The references, in the order of the outputs; together they cover all of them.
         degrees: The degrees mu_1, ..., mu_p, `TrackingLaw.degrees`.
 
-    Attributes:
-        reference_parameters: Name -> default of each parameter of its references, shape (k,),
-            stacked in numeric parameter 0. References may share a parameter by its name.
-
     Raises:
         ReferenceSignalError: The references cover too few or too many outputs, or are not smooth
-            enough; or two of them have different values of a parameter with the same name.
+            enough.
         NonFiniteError: A reference is not finite during a run; the exception has the time.
     """
 
@@ -53,15 +47,12 @@ class ReferenceGenerator(TracedSystem):
 
     def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
         self.references, self.degrees = tuple(references), tuple(degrees)
-        self.reference_parameters = common_parameters(self.references)
-        block = reference_block(self.references, self.degrees, self.reference_parameters)
-        self._base = block  # Without commands.
+        self._base = block = reference_block(self.references, self.degrees)  # Without commands.
         super().__init__(block, sees_steps=False)
 
     def reference(self, time: float) -> FloatArray:
-        """R(t) at a time in s by the defaults of its parameters, shape (sum (mu_i + 1),)."""
-        given = {"time": np.array([time]), "parameters": self._base.default("parameters")}
-        (values,) = self._function.evaluate(*(given[source] for source in self._function.sources))
+        """R(t) at a time in s, without commands, shape (sum (mu_i + 1),)."""
+        (values,) = self._function.evaluate(*(np.array([time]) for _ in self._function.sources))
         if not self._function.is_valid:
             raise simulation_error(self._function.failure(), time, np.zeros(0), {})
         return values.copy()
@@ -70,59 +61,17 @@ class ReferenceGenerator(TracedSystem):
     def _function(self) -> BlockFunction:
         return BlockFunction(self._base, "", {"R": self._base.outputs["reference"]})
 
-    def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
-        """Changes a parameter of its references in a context, shape (k,), or all its entries.
 
-        Raises:
-            ReferenceSignalError: There is no such parameter, or the value does not fit.
-        """
-        self.check_context(context)
-        known = self.reference_parameters
-        if name not in known:
-            raise ReferenceSignalError(unknown_name("parameter of references", name, known))
-        owners = [each for each, default in known.items() for _ in range(default.size)]
-        given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
-        if given.shape not in ((), known[name].shape) or not all_finite(given):
-            raise ReferenceSignalError(
-                f"parameter '{name}' takes {known[name].size} finite numbers, got {value!r}"
-            )
-        values = context.get_numeric_parameter(0).CopyToVector()
-        values[np.array(owners) == name] = given
-        context.get_mutable_numeric_parameter(0).SetFromVector(values)
-
-
-def reference_block(
-    references: Sequence[Reference], degrees: Sequence[int], parameters: Mapping[str, FloatArray]
-) -> Block:
+def reference_block(references: Sequence[Reference], degrees: Sequence[int]) -> Block:
     """R(t) with its derivatives, as a block; see `ReferenceGenerator`."""
     if (covered := sum(reference.size for reference in references)) != len(degrees):
         raise ReferenceSignalError(
             f"the references cover {covered} outputs, the law has {len(degrees)}"
         )
-    symbols = {name: ca.SX.sym(name, value.size) for name, value in parameters.items()}
-    moved = [reference.with_parameters(symbols) for reference in references]
     wholes = map(_whole, references)
     ranges = (each.range for each in wholes if isinstance(each, TrajectoryReference))
-    return Block(
-        "reference",
-        outputs={"reference": traced_references(moved, degrees, TIME)},
-        parameters=stacked(list(symbols.values())),
-        start={"parameters": np.concatenate([*parameters.values()])} if parameters else {},
-        requirements=tuple(ranges),
-    )
-
-
-def common_parameters(references: Sequence[Reference]) -> dict[str, FloatArray]:
-    """The parameters of all references; two with one name must have one value."""
-    common: dict[str, FloatArray] = {}
-    for reference in references:
-        for name, value in reference.parameters.items():
-            if not np.array_equal(common.setdefault(name, value), value):
-                raise ReferenceSignalError(
-                    f"two references have a parameter '{name}', with {common[name]} and {value}: "
-                    "give them one value, or two names"
-                )
-    return common
+    outputs = {"reference": traced_references(references, degrees, TIME)}
+    return Block("reference", outputs=outputs, requirements=tuple(ranges))
 
 
 def traced_references(
@@ -272,13 +221,7 @@ class CommandedReferences(ReferenceGenerator):
         depth: int = 0,
     ) -> None:
         self.references, self.degrees = tuple(references), tuple(degrees)
-        self.reference_parameters = common_parameters(self.references)
-        if self.reference_parameters:
-            raise ReferenceSignalError(
-                "references with parameters cannot be commanded: write the numbers of "
-                f"{', '.join(self.reference_parameters)} into the expressions"
-            )
-        self._base = base = reference_block(self.references, self.degrees, {})
+        self._base = base = reference_block(self.references, self.degrees)
         self.commands = tuple(signals)
         command = ca.SX.sym("c", len(self.commands))
         states, rates, rows = list[ca.SX](), list[ca.SX](), list[ca.SX]()

@@ -88,8 +88,10 @@ def are_dependent(gradients: FloatArray) -> bool:
 
 
 def smallest_singular_value(matrix: FloatArray) -> float:
-    """Returns the smallest singular value of a matrix with no more rows than columns."""
-    return float(np.linalg.svd(matrix, compute_uv=False)[-1])
+    """Returns the smallest singular value: infinity if there is none, nan if one is not finite."""
+    if not np.isfinite(matrix).all():
+        return np.nan
+    return float(np.min(np.linalg.svd(matrix, compute_uv=False), initial=np.inf))
 
 
 def equilibrated(matrix: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, InitializeAutoDiff
 from pydrake.common import RandomDistribution
 from pydrake.symbolic import Expression, Variable
 from pydrake.systems.analysis import Simulator
@@ -85,16 +84,6 @@ def test_rates_offsets_and_the_start_are_drakes():
     again = Simulator(system)
     again.AdvanceTo(0.8)
     assert_allclose(angle, again.get_context().get_continuous_state_vector().value()[:1], atol=1e-6)
-
-
-def test_gradients_are_exact():
-    system = TracedSystem(pendulum()).ToAutoDiffXd()
-    context = system.CreateDefaultContext()
-    x = InitializeAutoDiff(np.array([0.4, -0.2])).ravel()
-    context.SetContinuousState(x)
-    rate = ExtractGradient(system.EvalTimeDerivatives(context).CopyToVector())
-    assert_allclose(rate, [[0.0, 1.0], [-9.81 * np.cos(0.4), -0.1]], atol=EXACT)
-    assert isinstance(context.get_time(), AutoDiffXd)
 
 
 def test_it_converts_to_expressions():

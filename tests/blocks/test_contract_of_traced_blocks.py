@@ -51,15 +51,6 @@ def commanded():
     return CommandedReferences(own, of.degrees, signals)
 
 
-def references_with_parameters():
-    def push(t, level, wave):
-        return level + wave[0] * ca.sin(wave[1] * t)
-
-    height = dd.SinusoidReference(0.3, 0.3, 1.5)
-    force = dd.ExpressionReference(push, {"level": 20.0, "wave": [5.0, 2.0]})
-    return dd.ReferenceGenerator([height, force], law("two_link").degrees)
-
-
 def robot(kind):
     found = arm("two_link") if kind is None else actuated("two_link", kind)
     return dd.RobotPlant(found.model, structure=found.structure)
@@ -109,7 +100,6 @@ BLOCKS = {
     ),
     "ReferenceGenerator": references,
     "CommandedReferences": commanded,
-    "ReferenceGenerator with parameters": references_with_parameters,
     "TrackingController": lambda: dd.TrackingController(law("two_link")),
     "TrackingController of a measured force": lambda: dd.TrackingController(measured_law(())),
     "TrackingController with the integral of a force": lambda: dd.TrackingController(

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from problems import PROBLEMS
 from pydrake import symbolic as sym
-from pydrake.systems.primitives import SymbolicVectorSystem
 
 from drake_dae import find_structure
 from drake_dae.blocks.symbolic import from_symbolic, to_casadi
@@ -112,37 +111,6 @@ def test_the_same_system_as_from_casadi():
         point = random.uniform(0.5, 2.0, 4), random.uniform(0.5, 2.0, 3)
         # The same operations up to their order.
         np.testing.assert_allclose(*(value(*point).full() for value in values), rtol=1e-14)
-
-
-def test_drakes_own_symbolic_system():
-    """m = 0: x'' = -sin x - c x' + cos(x) u; f is its dynamics at u = 0, h their slope."""
-    angle, rate, u, c = (sym.Variable(name) for name in ("angle", "rate", "u", "c"))
-    drake = SymbolicVectorSystem(
-        state=[angle, rate],
-        input=[u],
-        dynamics=[rate, -sym.sin(angle) - c * rate + sym.cos(angle) * u],
-        output=[angle],
-        parameter=[c],
-    )
-    dynamics = [drake.dynamics_for_variable(v) for v in (angle, rate)]
-    made = from_symbolic(
-        [angle, rate],
-        f=[row.Substitute(u, 0.0) for row in dynamics],
-        h=[row.Differentiate(u) for row in dynamics],
-        l=angle,
-        parameters={c: 0.3},
-    )
-    assert find_structure(made).output_degrees == (2,)
-    context = drake.CreateDefaultContext()
-    context.SetContinuousState([0.7, -0.4])
-    context.get_mutable_numeric_parameter(0).SetFromVector([0.3])
-    drake.get_input_port().FixValue(context, [1.7])
-    rates = ca.Function("rates", [made.state, made.parameter_symbol], [made.f + made.h * 1.7])
-    np.testing.assert_allclose(
-        rates([0.7, -0.4], [0.3]).full()[:, 0],
-        drake.EvalTimeDerivatives(context).CopyToVector(),
-        rtol=1e-14,
-    )
 
 
 @pytest.mark.parametrize(

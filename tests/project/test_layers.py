@@ -1,4 +1,4 @@
-"""Imports run one way, and only to what pyproject.toml declares; see tests/support/house.py."""
+"""Imports run one way (tests/support/house.py); each equation (1)-(83) has its line and test."""
 
 import re
 import subprocess
@@ -7,6 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 import pytest
+from equations import LAST, WITHOUT_LINE, lines, proofs, table
 from house import FLOORS, ROOT, WITHOUT_DRAKE, imports, modules, room, violations
 
 
@@ -85,3 +86,20 @@ def test_files_that_the_guide_names_exist() -> None:
     assert len(names) > 30
     for name in (first or second for first, second in names):
         assert (ROOT / name).exists() or (ROOT / "drake_dae" / name).exists(), name
+
+
+ALL = set(range(1, LAST + 1))
+
+
+def test_each_equation_has_a_line_or_a_reason():
+    places = set(lines())
+    assert places | set(WITHOUT_LINE) == ALL
+    assert not places & set(WITHOUT_LINE)
+
+
+def test_each_equation_has_a_test():
+    assert set(proofs()) == ALL
+
+
+def test_the_table_has_a_row_for_each():
+    assert table().count("\n") == LAST + 1

@@ -9,7 +9,6 @@ from pydrake.systems.analysis import Simulator
 
 from drake_dae import ConstantReference, ExpressionReference
 from drake_dae.dae import Signal
-from drake_dae.errors import ReferenceSignalError
 from drake_dae.systems import CommandedReferences
 from drake_dae.systems.references import RATE, RATES, SPEEDS
 
@@ -81,10 +80,3 @@ def test_without_commands_it_is_the_references():
     times = [0.0, 0.5, 1.5]
     found = followed(block, [0.0, 0.0], times)
     np.testing.assert_allclose(found, [own.derivatives([2, 0])(t) for t in times], atol=1e-12)
-
-
-def test_references_with_parameters_are_not_commanded():
-    """Both would be numeric parameter 0 of the block."""
-    given = ExpressionReference(lambda t, level: [level, 2.0 * level], {"level": 0.3})
-    with pytest.raises(ReferenceSignalError, match="level"):
-        CommandedReferences([given], [2, 0], SIGNALS)

@@ -27,10 +27,6 @@ MEMBERS = {
     "sinusoids": dd.SinusoidReference(1.0, [0.5, -0.2], [1.3, 2.1], [0.1, 0.7]),
     "point to point": dd.PointToPointReference([0.0, 2.0], [1.0, -1.0], 0.3, 1.7, order=3),
     "expression": dd.ExpressionReference(lambda t: [ca.exp(-t) * ca.cos(2 * t), t**3]),
-    "parameters": dd.ExpressionReference(
-        lambda t, rise, sway: [rise * ca.sin(2 * t), ca.dot(sway, ca.vertcat(t, t**2))],
-        {"rise": 0.3, "sway": [0.5, -0.2]},
-    ),
     "trajectory": TrajectoryReference(PATH),
     "line": dd.LineReference([0.0, 1.0], [0.8, 0.4], LIMITS, 0.2),
     "circle": dd.CircleReference([0.0, 1.0], 0.3, period=2.0),
@@ -117,27 +113,6 @@ def test_rule_5_what_is_too_rough_is_refused_before_it_is_used(name):
         ROUGH[name].derivatives([3] * size)
 
 
-def rule_7_with_other_parameters_it_is_another_reference_of_the_same_form(reference):
-    """With its own values it is the same, with symbols an expression of these."""
-    own = reference.with_parameters(reference.parameters)
-    degrees = [1] * reference.size
-    for time in TIMES:
-        np.testing.assert_array_equal(
-            own.derivatives(degrees)(time), reference.derivatives(degrees)(time)
-        )
-    if not reference.parameters:
-        return
-    symbols = {name: ca.SX.sym(name, value.size) for name, value in reference.parameters.items()}
-    time = ca.SX.sym("t")
-    rows = reference.with_parameters(symbols).expression(degrees, time)
-    for factor in (1.0, -2.0):
-        values = {name: factor * value for name, value in reference.parameters.items()}
-        found = ca.Function("R", [time, *symbols.values()], [rows])(0.4, *values.values())
-        wanted = reference.with_parameters(values).derivatives(degrees)(0.4)
-        np.testing.assert_allclose(found.full()[:, 0], wanted, rtol=1e-13)
-        assert factor == 1.0 or not np.allclose(wanted, reference.derivatives(degrees)(0.4))
-
-
 def rule_6_traced_together_the_values_are_the_same(reference):
     """Beside another, all as one function or one after the other; and as an expression."""
     degrees = [2] * reference.size
@@ -159,7 +134,6 @@ RULES = (
     rules_1_and_2_size_and_layout,
     rule_3_each_derivative_is_that_of_the_one_before,
     rule_4_a_value_depends_on_the_time_alone,
-    rule_7_with_other_parameters_it_is_another_reference_of_the_same_form,
     rule_6_traced_together_the_values_are_the_same,
 )
 

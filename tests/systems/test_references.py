@@ -165,43 +165,6 @@ def test_what_is_no_reference_is_refused():
         dd.ReferenceGenerator([dd.ConstantReference(0.3), 0.5], [0, 0])
 
 
-def pushing():
-    """Two references that share a parameter, and one with two entries."""
-    rise = dd.ExpressionReference(lambda t, rise: rise * ca.sin(2 * t), {"rise": 0.3})
-    push = dd.ExpressionReference(
-        lambda t, rise, push: rise + ca.dot(push, ca.vertcat(1, t)),
-        {"rise": 0.3, "push": [5.0, 1.0]},
-    )
-    return dd.ReferenceGenerator([rise, push], [1, 0])
-
-
-def test_parameters_stand_in_the_context():
-    generator = pushing()
-    context = generator.CreateDefaultContext()
-    context.SetTime(0.5)
-    port = generator.GetOutputPort("reference")
-    np.testing.assert_array_equal(port.Eval(context), generator.reference(0.5))
-    generator.set_parameter(context, "rise", 0.1)
-    generator.set_parameter(context, "push", [2.0, 4.0])
-    wanted = [0.1 * np.sin(1.0), 0.2 * np.cos(1.0), 0.1 + 2.0 + 4.0 * 0.5]
-    np.testing.assert_allclose(port.Eval(context), wanted, rtol=1e-15)
-
-
-def test_wrong_parameters_are_refused():
-    generator = pushing()
-    context = generator.CreateDefaultContext()
-    with pytest.raises(ReferenceSignalError, match=r"'ris'.*'rise'"):
-        generator.set_parameter(context, "ris", 0.1)
-    with pytest.raises(ReferenceSignalError, match=r"push.*2"):
-        generator.set_parameter(context, "push", [1.0, 2.0, 3.0])
-    with pytest.raises(ReferenceSignalError, match="nan"):
-        generator.set_parameter(context, "rise", np.nan)
-    with pytest.raises(ReferenceSignalError, match="'a'"):
-        dd.ExpressionReference(lambda t, a: a * t, {"a": [np.inf]})
-    with pytest.raises(ReferenceSignalError, match="TypeError"):
-        dd.ExpressionReference(lambda t: t, {"a": 1.0})
+def test_symbols_besides_the_time_are_refused():
     with pytest.raises(ReferenceSignalError, match=r"\bb\b"):
-        dd.ExpressionReference(lambda t, a: a * t + ca.SX.sym("b"), {"a": 1.0})
-    one, two = (dd.ExpressionReference(lambda t, a: a * t, {"a": a}) for a in (1.0, 2.0))
-    with pytest.raises(ReferenceSignalError, match="'a'"):
-        dd.ReferenceGenerator([one, two], [0, 0])
+        dd.ExpressionReference(lambda t: t + ca.SX.sym("b"))
