@@ -309,7 +309,7 @@ class RobotModel:
 
     @cached_property
     def _step(self) -> TracedFunction | None:
-        """Newton's shortest step from any point by the matrix of q, to all outputs of few joints."""
+        """The shortest Newton step from any point by the matrix of q, if the robot is small."""
         inputs, outputs = self._placed
         phi, h_1, J, P = outputs.values()
         q, rows = self.links.q, phi.numel() + h_1.numel()
