@@ -8,7 +8,7 @@ import pytest
 from arms import arm, fixed_step
 from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import SimulatorConfig
-from runs import scenario
+from runs import scenario, scenario_model
 
 from drake_dae import (
     ConstantReference,
@@ -29,7 +29,6 @@ from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
 from drake_dae.running import export_loop, start_values
 from drake_dae.scenario.form import load_yaml
-from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(

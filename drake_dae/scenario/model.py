@@ -40,11 +40,6 @@ NOTHING_FOUND = "no start was found"  # So the note begins if none is good along
 _TIMES, _SLACK, _LARGE = 201, 1e-6, 10.0
 
 
-def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
-    """The robot model of a scenario: constraints, outputs and actuation."""
-    return completed_model(scenario, scene_graph)[1]
-
-
 @checked(lambda text: ScenarioError(("", text)))
 def complete_scenario(scenario: Scenario) -> Completed:
     """Adds missing outputs and a start to a scenario, with the choices in words.
@@ -80,7 +75,7 @@ def completed_model(
     payloads: Sequence[Payload] = (),
     robot: RobotLinks | None = None,
 ) -> tuple[Completed, RobotModel, Structure | None]:
-    """The results of `complete_scenario` and `scenario_model`; the structure where it is known."""
+    """The result of `complete_scenario`, its robot model, and the structure where it is known."""
     if robot is None:
         drawn = scene_graph is not None
         robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)

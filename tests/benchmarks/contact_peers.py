@@ -32,7 +32,7 @@ from drake_dae.errors import DrakeDaeError
 from drake_dae.scenario import parts
 from drake_dae.scenario.build import build_completed, make_plant
 from drake_dae.scenario.gains import advised
-from drake_dae.scenario.model import scenario_model, scenario_structure
+from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.start import start_scenario
 from drake_dae.systems import ControlHold
 
@@ -320,7 +320,7 @@ def ours(condition: Condition, friction: float):
         *condition.settings,
     ]
     given = load_scenario(condition.scenario, settings)
-    model = scenario_model(given)
+    model = completed_model(given)[1]
     scenario = advised(given, model, scenario_structure(model)).scenario
     if condition.noise:  # Its gains are those for sensors without noise.
         noisy = Encoders(position_noise=ANGLE_NOISE, velocity_noise=RATE_NOISE, seed=1)

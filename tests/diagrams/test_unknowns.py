@@ -5,11 +5,10 @@ import pytest
 from numpy.testing import assert_allclose
 from pydrake.math import RollPitchYaw
 from pydrake.multibody.tree import JacobianWrtVariable
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, scenario_model
 
 from drake_dae import build_scenario
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.model import scenario_model
 
 W = 25.0
 STILL = (

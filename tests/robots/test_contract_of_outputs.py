@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from arms import arm
 from members import Pull, subclasses
-from runs import scenario
+from runs import scenario, scenario_model
 
 from drake_dae import (
     AxisCoordinates,
@@ -30,7 +30,6 @@ from drake_dae import (
 )
 from drake_dae.errors import ModelError
 from drake_dae.robots import ConstraintSet, PositionOutput, as_force_outputs, force_rows
-from drake_dae.scenario.model import scenario_model
 from drake_dae.trace.functions import TracedFunction
 
 WALL = PointOnSurface("tool", Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")

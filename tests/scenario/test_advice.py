@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import numbers
-from runs import scenario
+from runs import scenario, scenario_model
 
 from drake_dae import build_scenario, contact_gains, load_scenario, simulate
 from drake_dae.dae import Parameter, advised_gains
@@ -24,7 +24,7 @@ from drake_dae.scenario.gains import (
     stated_errors,
 )
 from drake_dae.scenario.judging import find_feasibility, judge_run
-from drake_dae.scenario.model import scenario_model, scenario_structure
+from drake_dae.scenario.model import scenario_structure
 from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.start import start_scenario
 

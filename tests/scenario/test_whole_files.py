@@ -4,13 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import run_scenario, scenario_validator, untagged
+from runs import run_scenario, scenario_model, scenario_validator, untagged
 from scenario_texts import written
 
 from drake_dae import load_scenario
 from drake_dae.errors import GeometryWarning, ScenarioError
 from drake_dae.scenario.form import load_yaml
-from drake_dae.scenario.model import scenario_model
 
 ROBOTS = Path(__file__).parent / "robots"
 

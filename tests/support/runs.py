@@ -12,8 +12,9 @@ from _pytest.mark import ParameterSet
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
-from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
+from drake_dae import ClosedLoop, Record, RobotModel, build_scenario, load_scenario, simulate
 from drake_dae.scenario.build import roll_scenario
+from drake_dae.scenario.model import completed_model
 from drake_dae.scenario.scenario import Scenario, scenario_schema
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 
@@ -111,6 +112,11 @@ def first_quick(cases: Iterable[Any]) -> list[ParameterSet]:
 def scenario(name: str, *settings: str) -> Scenario:
     """A shipped scenario, with settings as those of `--set`."""
     return load_scenario(find_scenario(name), settings)
+
+
+def scenario_model(chosen: Scenario) -> RobotModel:
+    """The robot model of a scenario: constraints, outputs and actuation."""
+    return completed_model(chosen)[1]
 
 
 def untagged(data: Any) -> Any:

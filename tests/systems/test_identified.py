@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
+from runs import scenario_model
 
 from drake_dae import (
     DaePlant,
@@ -28,7 +29,6 @@ from drake_dae.dae import DerivativeLayout, Observation, Parameter, find_structu
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running import start_values
-from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import FOLDER
 from drake_dae.systems import Observing
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from arms import arm, tool_at_start
 from pydrake.multibody.tree import JacobianWrtVariable
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, scenario_model
 
 from drake_dae import (
     CircleReference,
@@ -20,7 +20,6 @@ from drake_dae import (
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import Touch
 from drake_dae.scenario import complete_scenario
-from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Postures, tool_axis
 from drake_dae.scenario.scenario import TiltFromNormalForm, save_scenario

@@ -10,11 +10,11 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
+from runs import scenario_model
 from vendors import joint, link, panda, robot, write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import RobotFileWarning, ScenarioError
-from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.reading import finalize, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 from pydrake.geometry import Role, SceneGraph
+from runs import scenario_model
 from vendors import write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import GeometryWarning, RobotFileWarning, ScenarioError
-from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
