@@ -30,7 +30,7 @@ from pydrake.systems.framework import (
 from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import NOTHING, Block, Held, Projection, is_same, stacked
-from drake_dae.blocks.primitives import symbolic_block
+from drake_dae.blocks.symbolic import symbolic_block
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError

@@ -6,8 +6,8 @@ from math import ceil
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.failures import LEAST_PROGRESS, PACE_STEPS
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepFunctions, StepSettings
-from drake_dae.blocks.trials import LEAST_PROGRESS, PACE_STEPS
 from drake_dae.errors import InconsistentStateError
 
 
@@ -43,7 +43,7 @@ class _Interpreted:
         """The first result of a function, now; notes the earliest trial without a value."""
         given = time, state, self.held, self.problem.parameters
         value = self.functions.buffered[name](*given)[0].copy()
-        if time < self.trial_time and np.isfinite(state).all() and not np.isfinite(value).all():
+        if not np.isfinite(value).all() and time < self.trial_time and np.isfinite(state).all():
             self.trial_time, self.trial = time, np.array(state)
         return value
 

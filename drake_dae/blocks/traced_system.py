@@ -28,9 +28,8 @@ from pydrake.systems.framework import (
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed
 from drake_dae.blocks.block import Block, BlockFunction, is_same, stacked
-from drake_dae.blocks.failures import off_manifold, simulation_error
+from drake_dae.blocks.failures import StepWatch, off_manifold, simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.blocks.trials import StepWatch
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.trace.compiled import Compiled
 

@@ -29,10 +29,9 @@ Vectors = Mapping[str, Sequence[Signal]]  # Name of a vector -> names and units 
 class BlockCode:
     """A part of a diagram as functions in C, and its numbers at a start.
 
-    Each input of the block is a parameter of these functions: first come the parameters of the
-    block, then inputs that keep their value in the context (`places`), and last `inputs`, those of
-    each step. `parameters` and `values` are without these. Held values that are nan at the start
-    come from the function "begin". `known` names outputs whose blocks do not name them.
+    Parameters of the functions are those of the block, then inputs that keep their value
+    (`places`), and last `inputs`, those of each step, which `parameters` and `values` leave out.
+    `known` names outputs whose blocks do not name them.
     """
 
     def __init__(

@@ -59,10 +59,7 @@ IN_ROLLOUT = "Run it by simulate with integration_scheme 'radau3', or choose a s
 
 
 class RunWatch:
-    """Looks at a run from a context on: does it diverge, stop, or take very many steps, and why.
-
-    The errors of a `Controller` are looked at if there is exactly one `Plant`.
-    """
+    """Looks at a run from a context on: does it diverge, stop, or take very many steps, and why."""
 
     def __init__(
         self, diagram: System, context: Context, config: SimulatorConfig, duration: float
@@ -111,12 +108,7 @@ class RunWatch:
             )
 
     def explain(self, error: DrakeDaeError | RuntimeError, context: Context) -> DrakeDaeError:
-        """The error with its cause.
-
-        Looked for in this order: divergence within a few steps, ports without wires, a singular
-        A(x) or B(x) and the reach of the path, drives at their limits, and steps that are too long
-        for a stiff loop.
-        """
+        """The error with its cause: divergence, a port without a wire, or as `with_cause`."""
         try:
             self._check_divergence(context, states_only=True)
         except SimulationError as diverged:
@@ -145,7 +137,7 @@ class RunWatch:
         return self.with_cause(told, context)
 
     def with_cause(self, error: SimulationError, context: Context | None = None) -> SimulationError:
-        """As `explain`, of an error with a state; limits of drives only in a context at its end."""
+        """With a singular A(x) or B(x), the reach, drives cut off at the end, or too long steps."""
         if (found := self._singular(error)) is not error:
             return found
         limits = next((b for b in self._blocks if isinstance(b, ControlLimits)), None)
@@ -324,12 +316,10 @@ def _blocks_of(system: System) -> Iterator[System]:
 class DivergenceWatch:
     """Raises an error if states, controls or tracking errors grow beyond all bounds.
 
-    A state is compared with its initial value and with `DaeSystem.scale`. The tracking error z - r
-    of an output is compared with the largest value of the reference up to now, and of outputs,
-    states, forces and controls at the start, in the same unit. A control is compared with the
-    initial values in its unit, and only at the end of the run: if it is large before, as near a
-    singular configuration, the run fails with a better message. So no verdict depends on units, and
-    the force of an impact, the sag under a payload or a distant start are not divergence.
+    A state is compared with its initial value and `DaeSystem.scale`, an error z - r with the
+    largest reference so far and what has its unit at the start, a control with that at the end
+    only: if it is large before, as near a singular configuration, the run fails with a better
+    message. So no verdict depends on units, and the force of an impact is no divergence.
     """
 
     def __init__(self, plant: Plant, duration: float) -> None:
@@ -436,10 +426,7 @@ def warn_if_stiff(
 
 
 def fastest_rate(diagram: System, context: Context, time: float, state: FloatArray) -> float:
-    """The largest |eigenvalue| of the derivative of a diagram's continuous state, in 1/s.
-
-    By central differences, in a copy of the context; nan where the derivative has no value.
-    """
+    """The largest |eigenvalue| of the derivative of the continuous state in 1/s, or nan."""
     copy, columns = context.Clone(), []
     try:
         for i, step in enumerate(1e-6 * np.maximum(1.0, np.abs(state))):

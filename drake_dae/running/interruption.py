@@ -14,11 +14,7 @@ AGAIN = 1e-3  # The delay in s after which a signal during a call of CasADi is r
 
 @contextmanager
 def ending_signals(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
-    """Calls a function when a signal asks the process to end, as long as the block lasts.
-
-    Python allows this in the main thread only; in other threads nothing changes. A SIGHUP that is
-    ignored, as under nohup, stays so.
-    """
+    """Calls a function when a signal asks the process to end; in its main thread alone."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -59,10 +55,7 @@ def end_at_once(number: signal.Signals) -> None:
 
 
 class Interruption:
-    """Stores the first signal, instead of an exception in the middle of a step.
-
-    A second one raises a KeyboardInterrupt.
-    """
+    """Stores the first signal; a second one raises a KeyboardInterrupt."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None

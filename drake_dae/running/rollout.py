@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context, Diagram
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.blocks.failures import (
+    PACE_STEPS,
     cannot_go_on,
     endless_steps,
     no_step_leads_on,
@@ -23,7 +24,6 @@ from drake_dae.blocks.failures import (
 from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
 from drake_dae.blocks.stepping import Look, Run, RunEnding, RunProblem, StepSettings
-from drake_dae.blocks.trials import PACE_STEPS
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
 from drake_dae.errors import (

@@ -151,10 +151,7 @@ class RolloutProgram:
     def machine_code(
         self, choice: Compiled, calls: float, is_all: bool, several: bool = False
     ) -> Stepper | None:
-        """Its code for one run or several; None if compiling takes longer than it saves.
-
-        Code that is already in the cache is used in any case, unless further runs will follow.
-        """
+        """Its code for one run or several; None if compiling takes longer than it saves."""
         tries = attempts("auto", self.functions.num_operations)
         make = choice is True or any(makes and calls >= least for least, makes in tries)
         if choice is False or self.drake is not None or not (make or is_all):
@@ -308,10 +305,7 @@ class RolloutProgram:
                 plant.check_start(one.state[part], values)
 
     def _without_inputs(self) -> Block:
-        """The block with values of unwired inputs as parameters, and what Drake computes as held.
-
-        Its only input is "noise", from which sources of random numbers take their next values.
-        """
+        """The block with "noise" as its input alone; others are parameters, or held if Drake's."""
         composed, block = self.composed, self.composed.block
         noise, random, stepped = list[ca.SX](), dict[str, Held](), dict[str, Held]()
         for name, (system, index) in composed.cuts.items():
@@ -378,9 +372,7 @@ def events_within(
 ) -> tuple[FloatArray, np.ndarray]:
     """The times of updates in s, and which rates are due at each, as bits; shapes (k,).
 
-    As in Drake, two updates are of one instant if their times offset + k period are the same to the
-    last bit; those of times that differ by round-off follow each other. An update close to the time
-    of a row is moved to it.
+    As in Drake, those that differ by round-off follow each other; one close to a row moves to it.
     """
     due: dict[float, int] = {}
     for number, (period, offset) in enumerate(rates):

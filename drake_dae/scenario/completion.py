@@ -297,17 +297,15 @@ class _Search:
                     found.append(postures.at(q))
             if found:
                 return sorted(found, key=lambda p: -postures.quality(p, named))
-        q, left = postures.nearest(named, begin, guesses)
+        q, residual = postures.nearest(named, begin, guesses)
         polished = postures.solve(named, begin, q)
         if polished is not None:
             return [postures.at(polished)]
-        missed, residual = list[str](), float(np.max(np.abs(left), initial=0.0))
+        missed = [f"{residual:.2g} (m or rad) is left of the constraints"] * (residual > 1e-6)
         for row, value, goal in zip(named, postures.at(q).rows[named], begin, strict=True):
-            if abs(goal - value) > 1e-6:
-                name, unit = self._signals[row].name, self._signals[row].unit
-                missed.append(f"{name} comes to {value:.4g} {unit}, and not to {goal:.4g} {unit}")
-        if residual > 1e-6:
-            missed.append(f"{residual:.2g} (m or rad) is left of the constraints")
+            name, unit = self._signals[row].name, self._signals[row].unit
+            text = f"{name} comes to {value:.4g} {unit}, and not to {goal:.4g} {unit}"
+            missed += [text] * (abs(goal - value) > 1e-6)
         text = (
             "the robot cannot start there within its joint limits; the nearest start found has: "
             f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "

@@ -173,7 +173,7 @@ def new_scenario(
 
 def _read(file: str) -> tuple[MultibodyPlant, Robot]:
     """The plant of a robot, with what must be left out of its file."""
-    robot, above = Robot(file, actuators="all"), [*Path(file).resolve().parents]
+    robot, above = Robot(file, actuators="all"), [*Path(file).absolute().parents]
     with warnings.catch_warnings():  # The scenario's own robot reports it.
         warnings.simplefilter("ignore", RobotFileWarning)
         missing, lost = needs_of(robot)
@@ -198,8 +198,8 @@ def _read(file: str) -> tuple[MultibodyPlant, Robot]:
 
 def _has_room(joint: Joint) -> bool:
     """Whether a joint turns or slides between limits."""
-    one = isinstance(joint, RevoluteJoint | PrismaticJoint)
-    return one and bool(joint.position_upper_limits()[0] > joint.position_lower_limits()[0])
+    lower, upper = joint.position_lower_limits(), joint.position_upper_limits()
+    return joint.num_velocities() == 1 and bool(upper[0] > lower[0])
 
 
 def _chosen(
@@ -227,7 +227,8 @@ def _chosen(
         robot = replace(robot, base=RobotPlacement(roots[0]))
 
     # The chain: joints that can work, from the base to the tip.
-    names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    named_joints = joint_names(plant)
+    names = {joint.index(): name for name, joint in named_joints.items()}
     couplings = couplings_of(plant) if plant.num_constraints() else []
     coupled = {name for c in couplings for name in (c.follower, c.leader)}
     works = [j for j in joints if _has_room(j) and names[j.index()] not in coupled]
@@ -271,12 +272,10 @@ def _chosen(
         why = f"the end of the longest chain, of {len(chain)} joints"
 
     # All else is locked, at zero or the nearest limit; what mimics follows.
-    moving = [names[joint.index()] for joint in chain]
-    locked = dict[str, float]()
-    for joint in joints:
-        is_simple = isinstance(joint, RevoluteJoint | PrismaticJoint)
-        name = names.get(joint.index(), "")
-        if is_simple and name not in {*moving, *(c.follower for c in couplings)}:
+    moving, locked = [names[joint.index()] for joint in chain], dict[str, float]()
+    for name, joint in named_joints.items():
+        others = {*moving, *(c.follower for c in couplings)}
+        if joint.num_velocities() == 1 and name not in others:
             low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
             locked[name] = float(min(max(0.0, low), high))
     return replace(robot, locked=locked), tip, moving, {"frame": why}

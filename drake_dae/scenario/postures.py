@@ -170,7 +170,7 @@ class Postures:
 
     def nearest(
         self, rows: Sequence[int], wanted: FloatArray, guesses: Iterable[FloatArray]
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, float]:
         """The configuration within limits nearest to given values, and what constraints miss."""
         from scipy.optimize import least_squares  # Imported here, since few runs need it.
 
@@ -186,7 +186,7 @@ class Postures:
         gradient, bounds = lambda q: weights[:, None] * slopes(q), (low, high)
         fits = [least_squares(weighted, q, gradient, bounds, max_nfev=50) for q in tried]
         q = min(fits, key=lambda fit: float(fit.cost)).x
-        return q, residual(q)[: self._count]
+        return q, float(np.max(np.abs(residual(q)[: self._count]), initial=0.0))
 
     def _residual(self, rows: Sequence[int], wanted: FloatArray):  # type: ignore[no-untyped-def]
         """The equations of `solve`, shape (k + len(rows),), and their slopes."""

@@ -301,10 +301,7 @@ class Journal:
 
 @contextmanager
 def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
-    """Creates the file of a sweep with missing folders, or opens it to continue.
-
-    `head` says what the sweep is, name -> text; equal sweeps have equal ones.
-    """
+    """Creates the file of a sweep with missing folders, or opens that with an equal `head`."""
     unusable = f"cannot use {brief(str(path))} as the file of a sweep: "
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -370,8 +367,7 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
 class Runner:
     """Makes runs of a sweep, and keeps the closed loop as long as the structure is the same.
 
-    `lasting` is the simulated time of all runs with one loop, in s, for rollouts; None for Drake's
-    Simulator. `builds` counts the loops that were built.
+    `lasting`: the simulated time of all runs with one loop, in s, for rollouts.
     """
 
     def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:

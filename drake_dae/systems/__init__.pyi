@@ -6,8 +6,8 @@ from .applied_control import Sampling as Sampling
 from .break_away import Observing as Observing
 from .compliant_plant import CompliantPlant as CompliantPlant
 from .contact_forces import DisturbanceForce as DisturbanceForce
-from .contact_material import ContactMaterial as ContactMaterial
-from .contact_material import PointMaterial as PointMaterial
+from .contact_laws import ContactMaterial as ContactMaterial
+from .contact_laws import PointMaterial as PointMaterial
 from .contact_plant import ContactPlant as ContactPlant
 from .controller import Controller as Controller
 from .controller import TrackingController as TrackingController

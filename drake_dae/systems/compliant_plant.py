@@ -17,7 +17,9 @@ from drake_dae.dae import ConstraintStructure, Signal, find_constraint_structure
 from drake_dae.errors import ModelError
 from drake_dae.robots import RobotModel
 from drake_dae.systems.contact_laws import (
+    FRICTION,
     PointContact,
+    PointMaterial,
     ball_normals,
     contact_force,
     contact_force_signals,
@@ -25,7 +27,6 @@ from drake_dae.systems.contact_laws import (
     point_contacts,
     touching,
 )
-from drake_dae.systems.contact_material import FRICTION, PointMaterial
 from drake_dae.systems.ideal_plants import joint_outputs
 from drake_dae.systems.plant import ParameterizedSystem, Plant, changed_parameters, port_signals
 from drake_dae.trace.factorization import PositiveDefiniteFactorization

@@ -20,8 +20,7 @@ from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.references import ExpressionReference
 from drake_dae.robots import RobotModel, Vector, contact_normals
-from drake_dae.systems.contact_laws import ball_normals, point_contacts
-from drake_dae.systems.contact_material import ContactMaterial
+from drake_dae.systems.contact_laws import ContactMaterial, ball_normals, point_contacts
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
 

@@ -55,8 +55,12 @@ from drake_dae.systems.contact_forces import (
     DisturbanceForce,
     contact_block,
 )
-from drake_dae.systems.contact_laws import ball_normals, contact_force_signals, touching
-from drake_dae.systems.contact_material import ContactMaterial
+from drake_dae.systems.contact_laws import (
+    ContactMaterial,
+    ball_normals,
+    contact_force_signals,
+    touching,
+)
 from drake_dae.systems.plant import Plant, changed_parameters
 
 

@@ -10,7 +10,6 @@ from mpmath import mp, mpf
 from numpy.testing import assert_allclose
 from referee import compare
 from referee.__main__ import main
-from referee.closures import rows_of
 from referee.compare import (
     Cell,
     compare_motion,
@@ -20,14 +19,11 @@ from referee.compare import (
     state_of,
     wanted_forces,
 )
-from referee.derive import State, state
+from referee.derive import State, exact, frames, rows_of, state
 from referee.description import Mechanism, force_names
 from referee.engines import ours
-from referee.kinematics import frames
-from referee.mechanisms import MECHANISMS
-from referee.motion import integrated
-from referee.reference import MOTIONS, STATES, lines_of, load
-from referee.vectors import add, apply, dot, exact, scaled, sub, transposed
+from referee.reference import MOTIONS, STATES, integrated, lines_of, load
+from referee.spatial import MECHANISMS
 from runs import some
 
 WIDE = ("stewart", "delta", "two_arms", "humanoid")
@@ -98,11 +94,10 @@ def energy(mechanism: Mechanism, found: State):
     bodies, total = frames(mechanism, found.q, found.v), mpf(0)
     for body in mechanism.bodies:
         frame = bodies[body.name]
-        center, mass = frame.point(exact(body.center)), mpf(repr(body.mass))
-        spin = apply(transposed(frame.rotation), frame.spin)
-        total += mass * dot(center.velocity, center.velocity) / 2
-        total += sum(i * w * w for i, w in zip(exact(body.inertia), spin, strict=True)) / 2
-        total -= mass * dot(exact(mechanism.gravity), center.place)
+        (place, velocity, _), mass = frame.point(exact(body.center)), mpf(repr(body.mass))
+        spin = frame.rotation.T @ frame.spin
+        total += mass * (velocity @ velocity) / 2 + exact(body.inertia) @ spin**2 / 2
+        total -= mass * (exact(mechanism.gravity) @ place)
     return total
 
 
@@ -114,7 +109,7 @@ def test_motions_of_the_reference_keep_their_energy_to_thirty_digits(name, state
 
     def at(lines):
         own = lines[name]
-        values = [[mpf(own[f"{part}{i}"]) for i in range(mechanism.size)] for part in "qv"]
+        values = (np.array([mpf(own[f"{p}{i}"]) for i in range(mechanism.size)]) for p in "qv")
         return energy(mechanism, State(*values, [], {}))
 
     assert at(moved) == pytest.approx(at(stated), rel=1e-30)
@@ -124,7 +119,7 @@ def test_motions_of_the_reference_keep_their_energy_to_thirty_digits(name, state
 
 def test_the_integrator_of_the_reference_has_thirty_five_digits():
     """x'' = -x for a while, against the cosine."""
-    y = integrated(lambda y: [y[1], -y[0]], [mpf(1), mpf(0)], mpf(2), 14)
+    y = integrated(lambda y: np.array([y[1], -y[0]]), exact([1, 0]), mpf(2), 14)
     assert abs(y[0] - mp.cos(2)) < mpf(10) ** -35
     assert abs(y[1] + mp.sin(2)) < mpf(10) ** -35
 
@@ -138,11 +133,10 @@ def test_the_world_pushes_as_much_as_momentum_changes(name):
     needed = exact((0.0, 0.0, 0.0))
     for body in mechanism.bodies:
         frame = bodies[body.name]
-        center = frame.point(exact(body.center))
-        _, C = frame.columns(center.place, mechanism.size)
-        moved = [scaled(a, c) for a, c in zip(found.acceleration, C, strict=True)]
-        rate = sub(add(center.acceleration, *moved), exact(mechanism.gravity))
-        needed = add(needed, scaled(mpf(repr(body.mass)), rate))
+        place, _, acceleration = frame.point(exact(body.center))
+        _, C = frame.columns(place, mechanism.size)
+        rate = acceleration + found.acceleration @ C - exact(mechanism.gravity)
+        needed = needed + rate * mpf(repr(body.mass))
     pushed = dict.fromkeys("xyz", mpf(0))
     for closure in mechanism.closures:
         if closure.body_a == "world":
@@ -169,7 +163,7 @@ def test_redundant_forces_are_the_least_of_all_with_their_sum(name, stated):
         values = values[2::3]
     if name == "bricard":
         # Its moments about the axes of body A that are held.
-        axes = np.array(transposed(bodies[closures[0].body_a].rotation), dtype=float)
+        axes = bodies[closures[0].body_a].rotation.T.astype(float)
         held = axes[np.array(closures[0].direction) == 0.0]
         values = np.concatenate([held @ values[:3], values[3:]])
     assert_allclose(idle @ values, 0.0, atol=1e-10 * np.abs(values).max())

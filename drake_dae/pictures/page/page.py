@@ -5,7 +5,7 @@ import html
 import json
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,10 +13,14 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.tree import Frame
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, PortDataType
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.blocks.block import stacked
 from drake_dae.blocks.compose import compose
 from drake_dae.dae import DaeSystem
 from drake_dae.diagrams.closed_loop import ClosedLoop
@@ -28,9 +32,19 @@ from drake_dae.pictures.page.controls import (
     pushes_of,
     strongest_pushes,
 )
-from drake_dae.pictures.page.scene import RobotScene, meshcat_page, scene_size
+from drake_dae.robots import (
+    Constraint,
+    ConstraintWrenches,
+    PointCoordinates,
+    RobotModel,
+    rotation_of,
+)
 from drake_dae.running.c_code import BlockCode
 from drake_dae.running.export import check_traced, write_loop
+from drake_dae.scene.arrows import path_of
+from drake_dae.scene.surroundings import scene_points
+from drake_dae.scene.view import draw_scene, start_unwatched_meshcat, view_of_links
+from drake_dae.systems.plant import Plant
 from drake_dae.trace.compiled import compile_webassembly
 
 WEB = Path(__file__).with_name("web")
@@ -45,6 +59,7 @@ PUSHED_FRACTION = 0.15
 USUAL_POLE = 4.0
 # Commands take effect at multiples of this time after the start, in s, or of the steps near it.
 TICK = 1.0 / 120.0
+_BACKGROUND = [0.97, 0.97, 0.98]
 # The Content-Security-Policy of the page, which loads nothing from the network.
 _CONTENT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; "
@@ -126,11 +141,7 @@ def _page_of(page: str, data: Mapping[str, Any], code: str) -> str:
 
 
 def as_script(data: Any) -> str:
-    """Data as JSON for a script element, escaped so that no text in it ends the script.
-
-    Raises:
-        ModelError: A number is not finite.
-    """
+    """Data as JSON for a script element, escaped so that no text in it ends the script."""
     try:
         text = json.dumps(data, allow_nan=False)
     except ValueError:
@@ -139,11 +150,7 @@ def as_script(data: Any) -> str:
 
 
 class Bench:
-    """What a page shows and changes of a loop, from a context on; `size` is that of the scene in m.
-
-    `code` computes the outputs and their desired values, "change" of the phases of a task, "scene",
-    and "coordinates" of the errors.
-    """
+    """What a page shows and changes of a loop, from a context on; `size` is the scene's in m."""
 
     def __init__(self, loop: ClosedLoop, context: Context | None) -> None:
         """Of a loop, whose free inputs are 0 where they have no value."""
@@ -185,7 +192,8 @@ class Bench:
         self.code = code = BlockCode(composed, context, {}, loop.signals)
         self.numbers = Numbers(code.parameters, code.values, composed.parameters, code.places)
         self.state = plant.state(plant.GetMyContextFromRoot(context))
-        self.size = scene_size(robot, self.state, loop.scene_graph)
+        corners = scene_points(robot.model, robot.wrenches, self.state[None], loop.scene_graph)
+        self.size = float(np.linalg.norm(np.ptp(corners, axis=0)))
         self.controls = controls_of(loop, self.numbers, context.get_time(), self.size)
 
     def data(self) -> dict[str, Any]:
@@ -230,11 +238,136 @@ class Bench:
             },
             "prediction": self.predicted,
             "phase_names": list(loop.controller.phase_names),
-            "inputs": [
-                {**asdict(signal), "value": value}
-                for signal, value in zip(numbers.signals, numbers.values.tolist(), strict=True)
-            ],
+            "inputs": numbers.values.tolist(),
         }
+
+
+class RobotScene:
+    """The drawn parts of a robot: bodies, `surfaces` that move, `targets`: outputs of points."""
+
+    def __init__(self, plant: Plant, scene_graph: SceneGraph | None) -> None:
+        model, self.plant = plant.robot("a page"), plant
+        self.model = model
+        self.bodies, self.wrenches = _drawn_bodies(model, scene_graph), ConstraintWrenches(model)
+        self.surfaces = list[Constraint]()
+        for each in model.constraints:
+            # In a compliant contact their parameters move them, too.
+            names = {p.name for p in each.parameters if p.exogenous or not plant.is_ideal}
+            if names & {f"{each.name}.position", f"{each.name}.rpy"}:
+                self.surfaces.append(each)
+        self.targets = [each for each in model.outputs if isinstance(each, PointCoordinates)]
+
+    def columns(self, state: ca.SX, force: ca.SX, parameters: ca.SX) -> ca.SX:
+        """Numbers in the world, as one column of expressions.
+
+        12 for each body, R by columns and p; points of application, forces and moments of
+        all constraints; 12 for each surface; the point of each target.
+        """
+        model, links = self.model, self.model.links
+        symbols = [ca.vertcat(links.q, links.v), ca.SX.sym("force", model.dae.num_constraints)]
+        symbols.append(model.dae.parameter_symbol)
+        loads = self.wrenches.function.function.call([links.q, links.v, *symbols[1:]])[:3]
+        surfaces = list[ca.SX]()
+        for constraint in self.surfaces:
+            named = {parameter.name: parameter.symbol for parameter in constraint.parameters}
+            rpy = named.get(f"{constraint.name}.rpy")
+            surfaces.append(ca.SX.eye(3) if rpy is None else rotation_of(rpy))
+            surfaces.append(named[f"{constraint.name}.position"])
+        poses = [p for _, _, f in self.bodies for p in (links.rotation(f), links.position(f))]
+        points = [links.position(target.frame, target.point) for target in self.targets]
+        parts = [ca.vec(ca.densify(part)) for part in (*poses, *loads, *surfaces, *points)]
+        function = ca.Function("scene", symbols, ca.cse([stacked(parts)]))
+        return function(state[: symbols[0].numel()], force, parameters)
+
+    def data(self, state: FloatArray, slider: Callable[[str, str], int | None]) -> dict[str, Any]:
+        """What the browser knows of these parts; `slider` gives the index of a slider."""
+        model, acting = self.model, list(self.wrenches.constraints)
+        names = [signal.name for signal in self.plant.dae.output_signals]
+        constraints = [
+            {
+                "name": constraint.name,
+                "force": _path(constraint, "force"),
+                "moment": _path(constraint, "moment") if has_moment else None,
+            }
+            for constraint, has_moment in zip(acting, self.wrenches.with_moment, strict=True)
+        ]
+        surfaces = []
+        for surface in self.surfaces:
+            position = next(p for p in surface.parameters if p.name == f"{surface.name}.position")
+            direction = self._normal(surface, state).tolist() if surface in acting else None
+            surfaces.append(
+                {
+                    "name": surface.name,
+                    "path": _path(surface, "surface"),
+                    "controls": [slider("surface", s.name) for s in position.signals],
+                    "direction": direction,
+                }
+            )
+        targets = []
+        for target in self.targets:
+            signals = zip(target.axes, target.signals(model.links), strict=True)
+            axes = [("xyz".index(axis), signal.name) for axis, signal in signals]
+            commanded = [(axis, slider("reference", name)) for axis, name in axes]
+            targets.append(
+                {
+                    "name": target.name or target.frame,
+                    "axes": [[axis, place] for axis, place in commanded if place is not None],
+                    "outputs": [[axis, names.index(name)] for axis, name in axes],
+                }
+            )
+        bodies = [{"name": name, "path": path} for name, path, _ in self.bodies]
+        return {
+            "bodies": bodies,
+            "constraints": constraints,
+            "surfaces": surfaces,
+            "targets": targets,
+        }
+
+    def _normal(self, surface: Constraint, state: FloatArray) -> FloatArray:
+        """The unit normal of a surface at its contact point: of the force at rest."""
+        model = self.model
+        rest = np.concatenate([state[: model.links.q.numel()], np.zeros(model.links.v.numel())])
+        multipliers = np.ones(sum(len(c.force_signals) for c in model.constraints))
+        row = list(self.wrenches.constraints).index(surface)
+        force = self.wrenches(rest, multipliers).forces[row]
+        return np.asarray(force / np.linalg.norm(force))
+
+
+def meshcat_page(robot: RobotScene, state: FloatArray, scene_graph: SceneGraph | None) -> str:
+    """Meshcat's page at the start, self-contained."""
+    meshcat = start_unwatched_meshcat()
+    meshcat.SetProperty("/Background", "visible", True)
+    for part in ("top_color", "bottom_color"):
+        meshcat.SetProperty("/Background/<object>", part, _BACKGROUND)
+    draw_scene(robot.plant, meshcat, scene_graph)
+    links = view_of_links(robot.plant, scene_graph, meshcat)
+    if links is not None:
+        context, port = links.CreateDefaultContext(), links.get_input_port()
+        port.FixValue(context, state[: port.size()])
+        links.ForcedPublish(context)
+    return str(meshcat.StaticHtml())
+
+
+def _drawn_bodies(
+    model: RobotModel, scene_graph: SceneGraph | None
+) -> list[tuple[str, tuple[str, ...], Frame]]:
+    """Name, path in Meshcat and frame of each moving body with geometry."""
+    plant = model.links.plant
+    if scene_graph is None or plant is None or plant.get_source_id() is None:
+        return []
+    inspector, bodies = scene_graph.model_inspector(), []
+    for frame in inspector.GetAllFrameIds():
+        body = plant.GetBodyFromFrameId(frame)
+        if body is None or plant.IsAnchored(body) or not plant.GetVisualGeometriesForBody(body):
+            continue
+        path = ("drake", "visualizer", *inspector.GetName(frame).split("::"))
+        bodies.append((body.scoped_name().get_full(), path, body.body_frame()))
+    return bodies
+
+
+def _path(constraint: Constraint, part: str) -> list[str]:
+    """The path in Meshcat of a constraint's "force", "moment" or "surface"."""
+    return path_of(constraint, part).strip("/").split("/")
 
 
 # ------------------------------------------------------------------ long functions in pieces
@@ -255,10 +388,7 @@ _ARGUMENTS = (
 
 
 def in_pieces(source: str, longest: int = LONGEST) -> str:
-    """Splits the long functions of a C source of CasADi into pieces, which each calls in turn.
-
-    The array `shared` passes values of a piece to later pieces.
-    """
+    """Splits long functions of C into pieces that pass values on by the array `shared`."""
     return _FUNCTION.sub(lambda function: _split(function, longest), source)
 
 

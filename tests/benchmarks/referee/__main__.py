@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 from referee.compare import ENGINES, compare_motion, compare_state, find_engines, page
-from referee.mechanisms import MECHANISMS
 from referee.reference import MOTIONS, STATES, load
+from referee.spatial import MECHANISMS
 
 
 def main() -> None:

@@ -8,11 +8,9 @@ from types import ModuleType
 
 import numpy as np
 
-from referee.derive import balance
+from referee.derive import balance, exact, frames
 from referee.description import Mechanism, force_names
-from referee.kinematics import frames
 from referee.reference import Lines
-from referee.vectors import exact
 
 ENGINES = ("ours", "drake_joints", "mujoco_engine", "pinocchio_engine")
 """The modules of `engines`: NAME, NOTE, `forces`, and where it has one `mass_matrix`, `after`."""

@@ -1,6 +1,7 @@
 """Mechanisms in space; gravity points along -z, unless stated."""
 
 from referee.description import FREE, Body, Closure, Mechanism, X, Y, Z
+from referee.planar import PLANAR_MECHANISMS
 
 LEAST = "least sum of squares of all forces and moments, N^2 + (N m)^2, moments about the point"
 
@@ -259,4 +260,19 @@ GEARS = Mechanism(
     duration=0.2,
 )  # fmt: skip
 
-SPATIAL_MECHANISMS = (TOP, BRICARD, STEWART, DELTA, TWO_ARMS, HUMANOID, TABLE, ROLLING_BALL, GEARS)
+MECHANISMS = {
+    mechanism.name: mechanism
+    for mechanism in (
+        *PLANAR_MECHANISMS,
+        TOP,
+        BRICARD,
+        STEWART,
+        DELTA,
+        TWO_ARMS,
+        HUMANOID,
+        TABLE,
+        ROLLING_BALL,
+        GEARS,
+    )
+}
+"""All mechanisms of the referee, by name."""

@@ -9,7 +9,7 @@ if (typeof viewer === "undefined") {
   element("state").className = "wrong";
 }
 const RATES = [0.1, 0.25, 0.5, 1, 2];
-const RESTARTS = ["pole", "known", "parameter", "released"];
+const RESTARTS = ["pole", "known", "released"];
 const [DESIRED, PREDICTED] = ["#1a9933", "#e08a00"];
 const MOST = 0.1; /* s of the clock that are made up for in one picture */
 

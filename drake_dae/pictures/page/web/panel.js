@@ -28,7 +28,6 @@ class Panel {
       }
       if (rows.length) place.append(make("details", { open }, make("summary", {}, title), ...rows));
     }
-    place.append(this.rest());
     const balls = [data.targets.some(({ axes }) => axes.length) && "the green ball (target)",
       data.surfaces.length && "the orange one (surface)"].filter(Boolean);
     const hints = [balls.length && `Drag ${balls.join(" or ")}.`,
@@ -44,23 +43,6 @@ class Panel {
     slider.addEventListener("input", () => this.set(i, Number(slider.value)));
     this.rows[i] = { slider, shown: make("output"), value: control.value };
     return make("label", {}, make("span", {}, title), this.rows[i].shown, slider);
-  }
-  /* Any other number, by its name. */
-  rest() {
-    const select = make("select", { ariaLabel: "parameter" }, ...data.inputs.map(({ name }, i) => new Option(name, i)));
-    const number = make("input", { type: "number", step: "any", ariaLabel: "value of the parameter" });
-    const unit = make("output");
-    const folder = make("details", {}, make("summary", {}, "All parameters"), select, make("label", {}, number, unit));
-    this.refresh = () => {
-      number.value = this.present[select.value];
-      unit.textContent = data.inputs[select.value].unit;
-    };
-    select.addEventListener("change", this.refresh);
-    folder.addEventListener("toggle", this.refresh);
-    number.addEventListener("change", () => {
-      if (Number.isFinite(number.valueAsNumber)) this.give(Number(select.value), number.valueAsNumber, "parameter");
-    });
-    return folder;
   }
   value(i) {
     return this.rows[i].value;
@@ -101,9 +83,8 @@ class Panel {
   }
   /* As at the start. */
   reset() {
-    this.present = data.inputs.map(({ value }) => value);
+    this.present = [...data.inputs];
     this.knows.checked = false;
     data.controls.forEach(({ value }, i) => this.show(i, value));
-    this.refresh();
   }
 }
