@@ -10,8 +10,14 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number, positive
-from drake_dae.dae.contact_gains import ContactGains, best_damping
-from drake_dae.dae.one_direction import Direction, DirectionGains, SensorNoise, sampled_loop
+from drake_dae.dae.contact_gains import ContactGains, best_damping, pole_gains
+from drake_dae.dae.one_direction import (
+    Direction,
+    DirectionGains,
+    SampledLoop,
+    SensorNoise,
+    sampled_loop,
+)
 from drake_dae.errors import GainError, ModelError
 
 _PHASE = 0.3
@@ -32,6 +38,10 @@ DECAY = 0.05
 SLOWER = (1.0, 0.5, 0.25)
 """The factors by which the integral and the observer along a contact are slowed, since both reduce
 damping; the first one for which there are gains is taken."""
+
+SHAPES = (1.5, 0.5), (1.0, 1.0)
+"""p / w and zeta: Butterworth's three poles, and three equal ones, both with a gain of 3 w of the
+velocity, which decides the loss of phase. Equal ones bear wrong masses with a slower estimator."""
 
 MODEL_ERROR, EVERY = 1.0, 2.0
 """An unknown force of 1 N appears or turns every 2 s."""
@@ -77,19 +87,19 @@ class SensedContact:
             if not value >= 0.0:
                 raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
 
-    def free(self, mass_error: float = 1.0) -> Direction:
-        """A free direction."""
-        return Direction(self.period, self.delay, mass_error=mass_error)
-
-    def contact(self, mass_error: float = 1.0, share: float = 1.0) -> Direction:
-        """The direction of the contact, with a fraction of its stiffness."""
-        stiffness = share * self.stiffness
-        return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
-
-    def noise_of(self, lever: float) -> SensorNoise:
-        """The noise of a distance that is computed from noisy angles."""
+    def loop(
+        self, rates: DirectionGains, contact: bool, mass_error: float = 1.0, share: float = 1.0
+    ) -> SampledLoop:
+        """That of a joint's free motion, or of the contact with a fraction of its stiffness."""
+        if not contact:
+            return sampled_loop(
+                Direction(self.period, self.delay, mass_error=mass_error), rates, self.noise
+            )
+        stiffness, lever = share * self.stiffness, self.contact_lever
+        direction = Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
         position, velocity = lever * self.noise.position, lever * self.noise.velocity
-        return replace(self.noise, position=position, velocity=velocity)
+        noise = replace(self.noise, position=position, velocity=velocity)
+        return sampled_loop(direction, rates, noise)
 
     @cached_property
     def best_damping(self) -> float:
@@ -111,43 +121,41 @@ class Part:
     @classmethod
     def of(cls, situation: SensedContact, w: float, rates: DirectionGains, contact: bool) -> "Part":
         """Of the linear loop with these gains, which belong to the rate w in 1/s."""
-        direction = situation.contact() if contact else situation.free()
-        lever = situation.contact_lever if contact else situation.lever
-        mobility = situation.mobility if contact else situation.free_mobility
-        loop = sampled_loop(direction, rates, situation.noise_of(lever))
+        loop = situation.loop(rates, contact)
         error, jump = loop.deviations()
+        mobility = situation.mobility if contact else situation.free_mobility
         step = MODEL_ERROR * mobility * loop.after_step() * (loop.period / EVERY) ** 0.5
         if contact:
             ramp = rates.gains[2] * RAMP / (mobility * situation.stiffness)
-            whole, roughness = float(np.linalg.norm([error, step, ramp])), lever * jump / mobility
-        else:
-            _, jump = sampled_loop(direction, rates, situation.noise_of(1.0)).deviations()
-            whole, roughness = float(np.hypot(error, step)), situation.inertia * jump
+            roughness = situation.contact_lever * jump / mobility
+            whole = float(np.linalg.norm([error, step, ramp]))
+        else:  # The loop is that of a joint; a point moves by its lever.
+            error, roughness = situation.lever * error, situation.inertia * jump
+            whole = float(np.hypot(error, step))
         return cls(w, rates, contact, whole, error, roughness)
 
 
 def is_stable(situation: SensedContact, part: Part) -> bool:
     """Whether a loop settles for all masses and stiffnesses for which it must be stable."""
-    quiet = SensorNoise(velocity_bandwidth=situation.noise.velocity_bandwidth)
-    cases = [(situation.free(mass), DECAY) for mass in MASSES]
+    cases = [(mass, 1.0, DECAY) for mass in MASSES]
     if part.is_contact:
         cases = [
-            (situation.contact(mass, share), DECAY if share >= 0.5 else 0.0)
+            (mass, share, DECAY if share >= 0.5 else 0.0)
             for mass, share in product(CONTACT_MASSES, STIFFNESSES)
         ]
     return all(
-        loop.radius < 1.0 - decay * part.rate * loop.period
-        for direction, decay in cases
-        for loop in [sampled_loop(direction, part.rates, quiet)]
+        situation.loop(part.rates, part.is_contact, mass, share).radius
+        < 1.0 - decay * part.rate * situation.period
+        for mass, share, decay in cases
     )
 
 
 def _free(situation: SensedContact, fast: float | None) -> list[Part]:
     """The predictions for free directions with all rates, and that of an estimator, in 1/s."""
     found = []
-    for w in _rates(situation):
-        p = 1.5 * w
-        rates = DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
+    for w, (shape, damping) in product(_rates(situation), SHAPES):
+        gains = pole_gains(shape * w, damping, 3)
+        rates = DirectionGains((gains[0], gains[1], gains[2]), 0.0, shape * w / 0.75, fast)
         found.append(Part.of(situation, w, rates, False))
     return found
 
@@ -164,12 +172,10 @@ def _along(situation: SensedContact, fast: float | None, share: float) -> list[P
 
 def noisiest_sensor(situation: SensedContact, part: Part, deviation: int) -> str:
     """The sensor whose noise causes most of an error (deviation 0), or of a roughness (1)."""
-    direction = situation.contact() if part.is_contact else situation.free()
-    lever = situation.contact_lever if part.is_contact else situation.lever
 
     def without(name: str) -> float:
         quiet = replace(situation, noise=replace(situation.noise, **{name: 0.0}))
-        return sampled_loop(direction, part.rates, quiet.noise_of(lever)).deviations()[deviation]
+        return quiet.loop(part.rates, part.is_contact).deviations()[deviation]
 
     return min(("position", "velocity", "force")[: 2 + part.is_contact], key=without)
 
@@ -224,7 +230,8 @@ def advised_gains(
     """Returns the gains with the least predicted errors that are smooth and stable enough.
 
     The gains are those of `contact_gains`, as functions of its rate w, for which free directions
-    and contacts have a value of their own; and the rate of a `StateEstimator`, if there is one.
+    and contacts have a value of their own, in free directions also with three equal poles in place
+    of Butterworth's; and the rate of a `StateEstimator`, if there is one.
     For each of them the loop of one direction is a linear system with samples, delay, law,
     observer and contact; its errors and its roughness follow from Lyapunov's equation, its
     stability from eigenvalues; see `sampled_loop`. The product of the errors of position and force
@@ -253,15 +260,17 @@ def advised_gains(
     if not candidates:
         raise GainError(_reason(situation, bounds))
     free, contact, fast = min(candidates, key=lambda found: bounds.order(found[:2]))
-    w, of_contact = free.rate, contact.rates
+    of_free, of_contact = free.rates, contact.rates
+    position, damping = of_free.poles
     return AdvisedGains(
         gains=ContactGains(
-            position_rate=1.5 * w,
+            position_rate=position,
             force_gain=of_contact.force_gain,
             constraint_damping=of_contact.gains[2],
-            observer_rate=2.0 * w,
+            observer_rate=of_free.observer_rate,
             observer_force_rate=of_contact.observer_rate,
-            friction_rate=w / 2.0,
+            friction_rate=of_free.observer_rate / 4.0,
+            position_damping=damping,
         ),
         state_rate=fast,
         position_error=free.error,
@@ -283,7 +292,7 @@ def _state_rates(situation: SensedContact) -> list[float | None]:
     """The rates of an estimator that are tried."""
     if not situation.estimates:
         return [None]
-    rates = [share * _rates(situation)[0] for share in (2.0, 4.0, 7.0, 12.0, 20.0)]
+    rates = [share * _rates(situation)[0] for share in (2.0, 2.8, 4.0, 7.0, 12.0, 20.0)]
     return [rate for rate in rates if rate * situation.period <= 0.5]
 
 

@@ -40,6 +40,7 @@ class ContactGains:
         observer_force_rate: The rate k_n of this observer in the directions of the constraint's
             reaction.
         friction_rate: The rate at which the observer identifies friction.
+        position_damping: zeta of the pair of these poles: 1/2 are Butterworth's, 1 equal ones.
     """
 
     position_rate: float
@@ -48,15 +49,24 @@ class ContactGains:
     observer_rate: float
     observer_force_rate: float
     friction_rate: float
+    position_damping: float = 0.5
 
     def position_gains(self, poles: int) -> list[float]:
         """Returns the gains of a position output with 2 poles, or with 3 and an integral.
 
-        As `gain_coefficients` takes them, lowest derivative first: Butterworth's polynomials,
-        s^2 + sqrt(2) p s + p^2 and s^3 + 2 p s^2 + 2 p^2 s + p^3.
+        As `gain_coefficients` takes them, lowest derivative first; see `pole_gains`.
         """
-        p = self.position_rate
-        return [p**2, 2.0**0.5 * p] if poles == 2 else [p**3, 2.0 * p**2, 2.0 * p]
+        return pole_gains(self.position_rate, self.position_damping, poles)
+
+
+def pole_gains(p: float, zeta: float, poles: int) -> list[float]:
+    """The coefficients of (s + p) (s^2 + 2 zeta p s + p^2), or s^2 + 2 sqrt(zeta) p s + p^2.
+
+    With zeta = 1/2 both are Butterworth's polynomials, with 1 they have equal poles.
+    """
+    if poles == 2:
+        return [p**2, 2.0 * zeta**0.5 * p]
+    return [p**3, (1.0 + 2.0 * zeta) * p**2, (1.0 + 2.0 * zeta) * p]
 
 
 @checked(ModelError)

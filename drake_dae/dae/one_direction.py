@@ -57,6 +57,12 @@ class DirectionGains:
     observer_rate: float
     state_rate: float | None = None
 
+    @property
+    def poles(self) -> tuple[float, float]:
+        """p and zeta of `pole_gains`."""
+        p = self.gains[0] ** (1.0 / 3.0)
+        return p, (self.gains[2] / p - 1.0) / 2.0
+
 
 @dataclass(frozen=True)
 class SampledLoop:
@@ -117,6 +123,13 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
         a = -c phi' - A K_i sigma_F - d                in a contact,
 
     with the sums sigma of the error and sigma_F of the force's error.
+
+    If samples are fast, white noise n of free positions leaves with the estimator's gains l_1 to
+    l_3 for q, v and a, whose poles are the roots of D = s^3 + l_1 s^2 + l_2 s + l_3,
+
+        e = -(l_3 s^3 + K_3 s^2 (l_2 s + l_3) + (K_2 s + K_1) (l_1 s^2 + l_2 s + l_3)) n / (P D),
+
+    P = s^3 + K_3 s^2 + K_2 s + K_1, of the variance T sigma_n^2 / (2 pi) int |e/n|^2 dw.
     """
     parts = ["e", "v", "sum", *(f"held{i}" for i in range(direction.delay))]
     parts += ["q", "w", "a"] if rates.state_rate else ["r", "before", "acted"]

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Self
 
 import casadi as ca
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, listed, vector
+from drake_dae.arrays import FloatArray, listed, show, vector
 from drake_dae.dae import DaeSystem, Parameter, Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation import ActuationChain, Stage, chain, diagonal_parameter
@@ -22,9 +23,13 @@ from drake_dae.robots.loads import Load
 from drake_dae.robots.loops import LoopState
 from drake_dae.robots.multibody import MultibodyExpressions
 from drake_dae.robots.outputs import ForceOutput, PositionOutput, as_force_outputs, force_rows
-from drake_dae.robots.statics import StaticBalance, StaticPlacement
 from drake_dae.trace.compiled import Compiled
+from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.numerics import NewtonModel, newton, once, shortest_steps
+
+MOST = 1000
+"""The largest product of unknowns and squared equations whose Newton step is traced."""
 
 
 @checked(ModelError)
@@ -132,7 +137,12 @@ class RobotModel:
         # Redundant rows mislead Newton's method.
         rows = [row for row in ca.vertsplit(self.dae.k) if not ca.depends_on(row, links.v)]
         phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
-        self.placing = StaticPlacement(self.dae, links.q, phi, h_1)
+        p, of_outputs = self.dae.parameter_symbol, ca.SX.sym("p", self.dae.parameter_symbol.numel())
+        h_1 = ca.substitute(h_1, p, of_outputs)
+        slopes = {"J": ca.jacobian(phi, links.q), "P": ca.jacobian(h_1, links.q)}
+        inputs = {"q": links.q, "parameters": p, "parameters of outputs": of_outputs}
+        self._placed = inputs, {"phi": phi, "h_1": h_1, **slopes}
+        self._placing = TracedFunction(f"{name} positions", *self._placed)
         self.balance = StaticBalance(self.dae, links, self.dae.m[h_1.numel() :, :])
         if nominal_positions is None:
             nominal = self._on_constraints(nominal)
@@ -245,7 +255,11 @@ class RobotModel:
 
     @checked(ModelError)
     def configuration(
-        self, outputs: ArrayLike | None, guess: ArrayLike, parameters: ArrayLike | None = None
+        self,
+        outputs: ArrayLike | None,
+        guess: ArrayLike,
+        parameters: ArrayLike | None = None,
+        of_outputs: ArrayLike | None = None,
     ) -> FloatArray:
         """q = psi(z_1) of (58), shape (nq,): the consistent configuration with given outputs.
 
@@ -254,16 +268,58 @@ class RobotModel:
             guess: Where Newton's method starts, shape (nq,); if the outputs do not determine q, the
                 one next to it is returned.
             parameters: Values of all parameters; the defaults if None.
+            of_outputs: Those in the outputs, if they are others, as those of a law.
 
         Raises:
             InconsistentStateError: There is no such configuration near the guess.
             ModelError: A shape does not fit.
         """
-        q = vector(f"{self.name}: guess", guess, self.links.q.numel())
+        start = vector(f"{self.name}: guess", guess, self.links.q.numel())
         count = 0 if outputs is None else len(self.position_signals)
         wanted = vector(f"{self.name}: outputs", [] if outputs is None else outputs, count)
         values = self.dae.parameter_vector(parameters)
-        return self.placing.solve(wanted, q, values, values)
+        own = values if of_outputs is None else self.dae.parameter_vector(of_outputs)
+        evaluated = once(lambda q: self._placing(q, values, own))
+        step = self._step if count == len(self.position_signals) else None
+
+        def residual(q: FloatArray) -> FloatArray:
+            phi, h_1, _, _ = evaluated(q)
+            return np.concatenate([phi, h_1[:count] - wanted])  # (58)
+
+        def linearize(q: FloatArray) -> NewtonModel | None:
+            if step is not None:
+                step.evaluate(q, values, own, wanted, q)
+                if step.is_valid:
+                    return NewtonModel(
+                        lambda x: step.evaluate(q, values, own, wanted, x)[0].copy(), True
+                    )
+            _, _, J, P = evaluated(q)
+            gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
+            return shortest_steps(gradients, residual)
+
+        q, _ = newton(start, linearize)
+        left = residual(q)
+        if not (size := float(np.max(np.abs(left), initial=0.0))) < 1e-10:
+            raise InconsistentStateError(
+                f"{self.name}: no configuration near the guess satisfies the constraints with "
+                f"outputs {show(wanted)}; {size:.2g} is left. They may be out of reach",
+                left,
+            )
+        return q
+
+    @cached_property
+    def _step(self) -> TracedFunction | None:
+        """The shortest Newton step from any point by the matrix of q, if the robot is small."""
+        inputs, outputs = self._placed
+        phi, h_1, J, P = outputs.values()
+        q, rows = self.links.q, phi.numel() + h_1.numel()
+        if not (0 < rows <= q.numel() and rows**2 * q.numel() <= MOST):
+            return None
+        at, wanted = ca.SX.sym("at", q.numel()), ca.SX.sym("outputs", h_1.numel())
+        factors = Factorization(ca.vertcat(J, P).T)
+        step = factors.shortest(ca.substitute(ca.vertcat(phi, h_1 - wanted), q, at))
+        inputs = {**inputs, "outputs": wanted, "at": at}
+        return TracedFunction(f"{self.name} positions", inputs, {"step": -step}, factors.pivot)
 
     @checked(ModelError)
     def rest_state(
@@ -369,3 +425,58 @@ def control_choice(
     nu = len(controls)
     chosen, _ = diagonal_parameter("control_weights", weights, nu, "", positive=True)
     return chosen, Parameter("free_control", np.zeros(nu), units[0] if len(units) == 1 else "")
+
+
+class StaticBalance:
+    """0 = f + g lambda + h u at v = 0, S lambda = z_2, solved for the stages' s, u and lambda."""
+
+    def __init__(self, dae: DaeSystem, robot: Links, S: ca.SX) -> None:
+        q, v, links = robot.q, robot.v, robot.q.numel() + robot.v.numel()
+        force, load = ca.SX.sym("lambda", dae.num_constraints), ca.SX.sym("z_2", S.shape[0])
+        control = ca.SX.sym("u", dae.num_controls)
+        balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
+        balance = ca.substitute(balance[q.numel() :], v, ca.SX.zeros(v.numel()))
+        balance = ca.vertcat(balance, ca.mtimes(S, force) - load)
+        all_forces = ca.substitute(dae.forces(force), v, ca.SX.zeros(v.numel()))
+        unknown = ca.vertcat(dae.state[links:], control, force)
+        self._unknowns = unknown.numel()
+        self._robot, self._stages = dae.name, dae.num_states - links
+        self._still = np.zeros(v.numel())
+        self._function = TracedFunction(
+            f"{dae.name} equilibrium",
+            {"q": q, "z_2": load, "s, u, lambda": unknown, "parameters": dae.parameter_symbol},
+            {"balance": balance, "gradient": ca.jacobian(balance, unknown), "lambda": all_forces},
+        )
+
+    def state(self, q: FloatArray, forces: FloatArray, parameters: FloatArray) -> FloatArray:
+        """The state at rest; ModelError if no drive holds the robot there."""
+        if not self._stages:  # Forces enter no state.
+            return np.concatenate([q, self._still])
+        state, _, left = self.rest(q, forces, parameters)
+        if left > 1e-6 * (1.0 + float(np.max(np.abs(forces), initial=0.0))):
+            raise ModelError(
+                f"{self._robot}: no control holds the robot at rest at q = {show(q)} with forces "
+                f"{forces}; {left:.2g} N m is left. It has fewer actuators than joints"
+            )
+        return state
+
+    def rest(
+        self, q: FloatArray, forces: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """The state at rest, lambda, and the largest remaining residual, at positions, for z_2."""
+        evaluated = once(lambda unknown: self._function(q, forces, unknown, parameters))
+
+        def linearize(unknown: FloatArray) -> NewtonModel | None:
+            balance, gradient, _ = evaluated(unknown)
+            gradient = gradient.reshape(balance.size, -1)
+            # Currents and forces differ by orders of magnitude.
+            scale = np.maximum(np.linalg.norm(gradient, axis=0), np.finfo(float).tiny)
+            steps = shortest_steps(gradient / scale, lambda x: evaluated(x)[0])
+            if steps is None:
+                return None
+            return NewtonModel(lambda x: steps.step(x) / scale, steps.is_regular)
+
+        solution, _ = newton(np.zeros(self._unknowns), linearize)
+        residuals, _, constraint_force = self._function(q, forces, solution, parameters)
+        state = np.concatenate([q, self._still, solution[: self._stages]])
+        return state, constraint_force, float(np.max(np.abs(residuals), initial=0.0))

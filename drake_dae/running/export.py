@@ -1,7 +1,7 @@
 """The controller of a loop as one step in C99, and a whole loop in C99 that runs over time."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from math import ceil, floor, gcd, lcm
 from pathlib import Path
@@ -98,7 +98,8 @@ def export_controller(
         ModelError: The controller acts continuously, or has a block that cannot be exported.
         OSError: A file cannot be written.
     """
-    part, diagram = ControllerPart(loop, context), _diagram_of(loop)
+    diagram = loop if isinstance(loop, Diagram) else loop.diagram
+    part = ControllerPart(diagram, context)
     ticks, start, code = part.ticks, context.get_time(), part.code
     count = max(1, min(MOST, floor(duration / ticks.period + 1e-9)))
     times = [ticks.time(ticks.at(start) + k) for k in range(count)]
@@ -111,19 +112,17 @@ def export_controller(
     return [*made, *write_replay(code, "controller", name, folder, run, step)]
 
 
-@dataclass(frozen=True)
 class Ticks:
-    """The instants of a controller's steps: tick k is at k period, k = 0, 1, ...; times in s."""
+    """The fewest instants k period, k = 0, 1, ..., that all updates are at; times in s.
 
-    period: float
-    rates: Mapping[tuple[float, float], tuple[int, int]]
-    """(period, offset) -> the number of ticks between its updates, and the tick of the first."""
+    `rates` are (period, offset) -> the number of ticks between updates, and the tick of the first.
+    """
 
-    @classmethod
-    def of(cls, rates: list[tuple[float, float]], alone: float = 0.0) -> "Ticks":
-        """The fewest ticks for which each update is at one; without any rate, each `alone`."""
+    def __init__(self, rates: list[tuple[float, float]], alone: float = 0.0) -> None:
+        """Of updates with these periods and offsets; without any each period is `alone`."""
+        self.period, self.rates = alone, dict[tuple[float, float], tuple[int, int]]()
         if not rates:
-            return cls(alone, {})
+            return
         # Without the round-off of computed times.
         exact = {rate: [Fraction(t).limit_denominator(10**9) for t in rate] for rate in rates}
         times = [time for pair in exact.values() for time in pair]
@@ -135,8 +134,10 @@ class Ticks:
                 f"periods and delays have no common tick above {float(tick):g} s: {known}. Choose "
                 "multiples of one period"
             )
-        counts = {rate: (int(p / tick), int(first / tick)) for rate, (p, first) in exact.items()}
-        return cls(float(tick), counts)
+        self.period = float(tick)
+        self.rates = {
+            rate: (int(p / tick), int(first / tick)) for rate, (p, first) in exact.items()
+        }
 
     def at(self, time: float) -> int:
         """The first tick at or after a time in s; times that differ by 1e-9 periods are equal."""
@@ -157,8 +158,7 @@ class ControllerPart:
     It acts at once if the control has direct feedthrough from measurements.
     """
 
-    def __init__(self, loop: ClosedLoop | Diagram, context: Context) -> None:
-        diagram = _diagram_of(loop)
+    def __init__(self, diagram: Diagram, context: Context) -> None:
         machine = list(_machine(diagram))
         plants = [system for system in machine if isinstance(system, Plant)]
         if len(plants) != 1:
@@ -199,7 +199,7 @@ class ControllerPart:
         inputs = {name: signals for name, signals in inputs.items() if name in measured}
         self.code = BlockCode(replace(composed, block=block), context, inputs, known)
         rates = [(rate.period, rate.offset) for rate in self.code.steps.rates]
-        self.ticks = Ticks.of(rates, plant.time_step)
+        self.ticks = Ticks(rates, plant.time_step)
         self.inputs = {name: leaf_port(measured[name]) for name in inputs}
         self.outputs = {name: leaf_port(outputs[name]) for name in block.outputs}
 
@@ -241,10 +241,6 @@ class ControllerPart:
             "steps": "".join(steps),
             "begin": begin,
         }
-
-
-def _diagram_of(loop: ClosedLoop | Diagram) -> Diagram:
-    return loop if isinstance(loop, Diagram) else loop.diagram
 
 
 def _machine(diagram: Diagram) -> Iterator[Any]:

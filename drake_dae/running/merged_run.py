@@ -156,7 +156,7 @@ class MergedRun:
         with suppress(DrakeDaeError, RuntimeError):
             run = cls(diagram, context)
             run.begin(context, config)
-            return run if _is_by_wires(diagram, context) else None
+            return run if _is_by_wires(run._leaves, context) else None
         return None
 
     def run(self, end: float, seen: Callable[[Context, int], bool]) -> bool:
@@ -260,7 +260,7 @@ def parameters_in(composed: Composed, context: Context) -> FloatArray:
     return np.concatenate(values)
 
 
-def _is_by_wires(diagram: Diagram, context: Context) -> bool:
+def _is_by_wires(leaves: Leaves, context: Context) -> bool:
     """Whether each connected input port has the value of its source, not a fixed one.
 
     Drake does not say which ports have fixed values. So the ports are compared at another state.
@@ -272,7 +272,7 @@ def _is_by_wires(diagram: Diagram, context: Context) -> bool:
     if moved.num_continuous_states():
         values: FloatArray = moved.get_continuous_state_vector().CopyToVector()
         moved.SetContinuousState(values + NEAR)
-    for (system, number), (source, k) in Leaves.of(diagram).sources.items():
+    for (system, number), (source, k) in leaves.sources.items():
         port, written = system.get_input_port(number), source.get_output_port(k)
         if port.get_data_type() == PortDataType.kVectorValued and port.size():
             given = port.Eval(system.GetMyContextFromRoot(moved))

@@ -43,7 +43,7 @@ frame is at the axis of a joint."""
 
 def read_working(file: str) -> tuple[MultibodyPlant, Robot]:
     """The plant of a robot, with what must be left out of its file."""
-    robot, above = Robot(file, actuators="all"), [*Path(file).resolve().parents]
+    robot, above = Robot(file, actuators="all"), [*Path(file).absolute().parents]
     with warnings.catch_warnings():  # The scenario's own robot reports it.
         warnings.simplefilter("ignore", RobotFileWarning)
         missing, lost = needs_of(robot)

@@ -147,10 +147,11 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         identified = "friction, loads, tilts and places of planes"
         if scenario.compliances is not None:
             identified = "friction and loads"
+    shape = "Butterworth's" if contact.position_damping < 0.75 else "equal"
     estimated = "" if fast is None else f", and an estimate of the state of {rounded(fast):g} 1/s"
     note = (
         f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
-        f"{period:g} s and {known_by}: Butterworth's poles of positions "
+        f"{period:g} s and {known_by}: {shape} poles of positions "
         f"at {rounded(contact.position_rate):g} 1/s, and of forces one at "
         f"{-rounded(contact.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
         f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an estimator of "

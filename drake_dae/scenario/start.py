@@ -181,7 +181,7 @@ def start_state(
     count = len(model.position_signals)
 
     def solve(near: FloatArray) -> FloatArray:
-        return model.placing.solve(outputs[:count], near, parameters, of_law)
+        return model.configuration(outputs[:count], near, parameters, of_law)
 
     # By default near the start of the completion.
     guess = start_guess(scenario, model.links, model.nominal_positions)

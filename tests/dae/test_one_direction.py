@@ -93,6 +93,23 @@ def test_deviations_are_those_of_a_loop_with_noise(direction, rates):
     assert np.sqrt(np.mean(np.diff(wanted[2000:]) ** 2)) == pytest.approx(deviations[1], rel=0.03)
 
 
+@pytest.mark.parametrize(("gains", "state_rate"), [(FREE.gains, 100.0), ((8e3, 1.2e3, 60.0), 60.0)])
+def test_noise_of_fast_samples_leaves_the_variance_of_the_docstring(gains, state_rate):
+    """By quadrature, with the poles of `ChainFilter`; the mean delay of 0.05 ms is neglected."""
+    period, slow = 1e-4, 20.0
+    roots = np.roots([1.0, 0.0, 0.0, 0.0, state_rate**4, 0.0, -((state_rate**2 * slow) ** 2)])
+    D = np.real(np.poly(roots[roots.real < 0.0]))
+    s = 1j * np.linspace(-2e4, 2e4, 400_001)
+    shown = np.polymul([gains[1], gains[0]], D[1:])
+    filtered = [D[3] + gains[2] * D[2], gains[2] * D[3], 0.0, 0.0]
+    through = np.polyval(np.polyadd(filtered, shown), s)
+    response = through / np.polyval(np.polymul([1.0, *gains[::-1]], D), s)
+    variance = period * np.trapezoid(np.abs(response) ** 2, s.imag) / (2.0 * np.pi)
+    rates = DirectionGains(gains, 0.0, slow, state_rate)
+    loop = sampled_loop(Direction(period, 0), rates, SensorNoise(1e-5))
+    assert loop.deviations()[0] == pytest.approx(1e-5 * variance**0.5, rel=0.02)
+
+
 @pytest.mark.parametrize(("direction", "rates"), CASES)
 def test_error_after_a_step_of_the_disturbance_is_that_of_a_loop(direction, rates):
     """Both are sums over the same samples, to round-off of sums of 5,000 numbers."""

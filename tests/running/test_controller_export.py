@@ -36,7 +36,7 @@ EVERYTHING = (
 def exported(folder, name: str, *settings: str, steps: float = 300) -> str:
     chosen = scenario(name, *settings)
     loop, context = build_scenario(chosen)
-    period = ControllerPart(loop, context).ticks.period
+    period = ControllerPart(loop.diagram, context).ticks.period
     export_controller(loop, context, name, folder, chosen.integrator, steps * period)
     return name
 
@@ -86,7 +86,7 @@ def test_a_controller_that_samples_nothing_is_one_step_too(tmp_path):
     loop = make_closed_loop(plant, law("two_link"), {"tool.z": 0.3, "wall.force": 20.0})
     context = loop.diagram.CreateDefaultContext()
     loop.set_state(context, found.structure.states[0])
-    assert ControllerPart(loop, context).code.steps.rates == []
+    assert ControllerPart(loop.diagram, context).code.steps.rates == []
     export_controller(loop, context, "arm", tmp_path, duration=0.03)
     done = played(tmp_path, "arm", "-O1")
     assert done.returncode == 0, done.stdout
@@ -283,10 +283,10 @@ def test_a_diagram_is_cut_at_its_plant(tmp_path):
 
 
 def test_ticks_are_the_largest_that_all_times_are_multiples_of():
-    ticks = Ticks.of([(0.001, 0.0), (0.001, 0.0025 - 0.002), (0.004, 0.0)])
+    ticks = Ticks([(0.001, 0.0), (0.001, 0.0025 - 0.002), (0.004, 0.0)])
     assert ticks.period == 0.0005
     assert [*ticks.rates.values()] == [(2, 0), (2, 1), (8, 0)]
     assert [ticks.at(time) for time in (0.0, 0.0005, 0.0005 + 1e-15, 0.0006)] == [0, 1, 1, 2]
     # To the bit those of Drake: 9 * 0.001 + 0.0005 is not 19 * 0.0005.
     assert ticks.time(19) == (0.0025 - 0.002) + 9 * 0.001
-    assert Ticks.of([], 0.01).period == 0.01
+    assert Ticks([], 0.01).period == 0.01

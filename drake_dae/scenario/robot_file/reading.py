@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import get_native_id
@@ -431,12 +430,13 @@ def _drive_joints(
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
     names = {_simple_joint(name, plant).index(): name for name in limits}
     for actuator in _actuators_of(plant):
-        name = names.pop(actuator.joint().index(), None)
+        name = names.get(actuator.joint().index())
         if name is None:
             plant.RemoveJointActuator(actuator)
         elif (limit := limits[name]) is not None:
             actuator.set_effort_limit(limit)
-    for index, name in names.items():
+    moved = {actuator.joint().index() for actuator in _actuators_of(plant)}
+    for index, name in ((index, name) for index, name in names.items() if index not in moved):
         joint, known = plant.get_joint(index), facts.get(index, {})
         effort = known.get("effort") or np.inf if limits[name] is None else limits[name]
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
@@ -482,22 +482,22 @@ def _cut(
                 f"frame '{parent_frame}' that it names as its parent: of that only the body "
                 f"'{frame.body().name()}' counts. Let <pose> place the joint at the frame"
             )
-    limits = {
-        "lower": joint.position_lower_limits()[0],
-        "upper": joint.position_upper_limits()[0],
-        "velocity_limit": joint.velocity_upper_limits()[0],
+    options: dict[str, Any] = {
+        "name": name,
+        "damping": joint.default_damping(),
+        "lower": float(joint.position_lower_limits()[0]),
+        "upper": float(joint.position_upper_limits()[0]),
+        "velocity_limit": float(joint.velocity_upper_limits()[0]),
     }
-    options: dict[str, Any] = {"damping": joint.default_damping(), "name": name}
     for actuator in _actuators_of(plant):
         if actuator.joint().index() == joint.index():
             if actuator.default_rotor_inertia() != 0.0:
                 raise ModelError(
                     f"joint '{name}' closes a loop, as all joints of it do that could be cut, and "
-                    "its motor has a rotor: that cannot be a constraint; leave one joint without "
-                    "motor"
+                    "the rotor of its motor cannot be a constraint; leave one joint without motor"
                 )
-            options["motor"], limits["effort_limit"] = True, actuator.effort_limit()
-    options |= {key: float(value) for key, value in limits.items() if isfinite(value)}
+            options |= {"motor": True, "effort_limit": float(actuator.effort_limit())}
+    options = {key: value for key, value in options.items() if value not in (np.inf, -np.inf)}
     slides = isinstance(joint, PrismaticJoint)
     axis = np.array(joint.translation_axis() if slides else joint.revolute_axis())
     bodies = [frame.body().index() for frame in frames]

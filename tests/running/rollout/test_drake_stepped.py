@@ -25,9 +25,7 @@ LATE = "sampling={period: 2.0e-3, delay: 3.0e-3}"
 
 LOOPS = {
     "a law with observer and integrals": ("wall_point_contact",),
-    "hydroelastic contact": ("wall_hydroelastic",),
     "a continuous law": ("two_link_wall", *CONTINUOUS),
-    "a continuous law whose references move": ("two_link_wall", *CONTINUOUS[:3]),
     "a law that acts late, at another period": ("two_link_wall", *CONTINUOUS, LATE),
     "a sensor that lags": ("two_link_wall", *CONTINUOUS, "sensors.force={time_constant: 0.002}"),
     "noise": ("wall_point_contact", NOISE),

@@ -1,7 +1,6 @@
 """Meshes that Drake cannot read or draw are left out by name; the rest of a robot is as it was."""
 
 import json
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -92,41 +91,30 @@ def test_geometry_stops_no_robot(kind: str, name: str, prepare, tmp_path: Path):
     assert count(scene_graph, Role.kIllustration) == 3
 
 
-def box_of_collada(file: Path, unit: float) -> None:
-    """A red box of 100 x 200 x 300 units as CAD programs write it."""
-    collada = pytest.importorskip("collada")
-    mesh = collada.Collada()
-    mesh.assetInfo.unitmeter = unit
-    mesh.assetInfo.unitname = "own"
-    effect = collada.material.Effect("paint", [], "phong", diffuse=(1.0, 0.0, 0.0, 1.0))
-    material = collada.material.Material("m", "m", effect)
-    mesh.effects.append(effect)
-    mesh.materials.append(material)
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-    source = collada.source.FloatSource("v", (signs * [50, 100, 150]).ravel(), ("X", "Y", "Z"))
-    geometry = collada.geometry.Geometry(mesh, "g", "g", [source])
-    inputs = collada.source.InputList()
-    inputs.addInput(0, "VERTEX", "#v")
-    faces = [0, 1, 3, 0, 3, 2, 4, 6, 7, 4, 7, 5, 0, 4, 5, 0, 5, 1]
-    faces += [2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 5, 7, 1, 7, 3]
-    geometry.primitives.append(geometry.createTriangleSet(np.array(faces), inputs, "r"))
-    mesh.geometries.append(geometry)
-    bound = collada.scene.MaterialNode("r", material, inputs=[])
-    node = collada.scene.Node("n", [collada.scene.GeometryNode(geometry, [bound])])
-    scene = collada.scene.Scene("s", [node])
-    mesh.scenes.append(scene)
-    mesh.scene = scene
-    written = BytesIO()  # Its writer leaves files open.
-    mesh.write(written)
-    file.write_bytes(written.getvalue())
+COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="UNIT" name="own"/></asset><library_effects><effect id="paint"><profile_COMMON>
+<technique sid="c"><phong><diffuse><color>1 0 0 1</color></diffuse></phong></technique>
+</profile_COMMON></effect></library_effects><library_materials><material id="m">
+<instance_effect url="#paint"/></material></library_materials><library_geometries>
+<geometry id="g"><mesh><source id="v"><float_array id="a" count="24">POINTS</float_array>
+<technique_common><accessor source="#a" count="8" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="w"><input semantic="POSITION" source="#v"/></vertices>
+<triangles count="12" material="r"><input semantic="VERTEX" source="#w" offset="0"/><p>0 1 3 0 3 2
+4 6 7 4 7 5 0 4 5 0 5 1 2 3 7 2 7 6 0 2 6 0 6 4 1 5 7 1 7 3</p></triangles></mesh></geometry>
+</library_geometries><library_visual_scenes><visual_scene id="s"><node id="n">
+<instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="r"
+target="#m"/></technique_common></bind_material></instance_geometry></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
 
 
-# pycollada sets the shape of arrays, also where the test writes its file.
-@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")
 @pytest.mark.parametrize("unit", [1.0, 0.001])
 def test_a_dae_is_drawn_in_its_unit_and_its_colors_by_films_as_well(unit: float, tmp_path: Path):
     """Drake's renderer of films takes a .gltf and no .dae; a .gltf has y upward, Drake turns it."""
-    box_of_collada(tmp_path / "box.dae", unit)
+    pytest.importorskip("collada")
+    points = (f"{x} {y} {z}" for x in (-50, 50) for y in (-100, 100) for z in (-150, 150))
+    text = COLLADA.replace("UNIT", str(unit)).replace("POINTS", " ".join(points))
+    (tmp_path / "box.dae").write_text(text)
     (tmp_path / "robot.urdf").write_text(
         '<robot name="r"><link name="a"><inertial><mass value="1"/><inertia ixx="1" iyy="1" '
         'izz="1" ixy="0" ixz="0" iyz="0"/></inertial><visual><geometry>'

@@ -108,6 +108,40 @@ def test_limits_without_room_go_where_a_joint_or_the_scenario_says_so(
             plant_of(file)
 
 
+# Words and motors.
+
+ONE = (
+    '<transmission type="SimpleTransmission"><joint name="{}"/><actuator name="m"/></transmission>'
+)
+WORDS = [
+    ("r.urdf", 'mass value="1"', 'mass value="${m}"', r"r\.urdf:\d+: link 'a'.*\{m\}"),
+    ("r.urdf", 'mass value="1"', 'mass value="1,5"', r"r\.urdf:\d+: link 'a'.*1,5"),
+    ("r.xml", 'angle="radian"', 'coordinate="global"', r"r\.xml.*global"),
+]
+
+
+@pytest.mark.parametrize(("name", "old", "new", "message"), WORDS)
+def test_words_that_are_no_numbers_and_global_coordinates_are_refused(
+    name, old, new, message, tmp_path
+):
+    text = robot("r", link("a", 1)) if name == "r.urdf" else MJCF.format(base="", mark="")
+    with pytest.raises(ModelError, match=message):
+        plant_of(written(tmp_path, text.replace(old, new), name))
+
+
+def test_motors_of_one_name_are_two_and_one_without_effort_is_lost(tmp_path):
+    """Many authors write 0 for an unknown effort, with which Drake makes no motor."""
+    joints = [joint("j", "a", "b", "0 1 0"), joint("k", "b", "c", "0 1 0")]
+    text = robot("r", *(link(name, 1) for name in "abc"), *joints, ONE.format("j"), ONE.format("k"))
+    plant = plant_of(written(tmp_path, text))
+    motors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    assert [(motor.name(), motor.joint().name()) for motor in motors] == [("m", "j"), ("m_2", "k")]
+    file = written(tmp_path, text.replace('effort="87.0"', 'effort="0"', 1))
+    with pytest.raises(ModelError, match=r"transmission/joint .*'j'"):
+        plant_of(file)
+    assert [*plant_of(file, actuators="all").GetEffortUpperLimits()] == [87.0, np.inf]
+
+
 # Inertias.
 
 MOMENTS = [
