@@ -43,7 +43,7 @@ class _Interpreted:
         """The first result of a function, now; notes the earliest trial without a value."""
         given = time, state, self.held, self.problem.parameters
         value = self.functions.buffered[name](*given)[0].copy()
-        if time < self.trial_time and np.isfinite(state).all() and not np.isfinite(value).all():
+        if not np.isfinite(value).all() and time < self.trial_time and np.isfinite(state).all():
             self.trial_time, self.trial = time, np.array(state)
         return value
 

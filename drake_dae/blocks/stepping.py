@@ -118,12 +118,14 @@ class StepFunctions:
         return sum(int(each.n_instructions()) for each in self.functions.values())
 
     @cached_property
-    def _expressions(self) -> tuple[ca.Function, ca.Function]:
+    def _expressions(self) -> tuple[Buffered, Buffered]:
         """The held values at the start of a run, and the parameters of the projection."""
         held, projection = self.block.held.values(), self.block.projection
         begun = [each.symbol if each.begin is None else each.begin for each in held]
         parameters = ca.SX(0, 1) if projection is None else projection.parameters
-        return self._function("begin", [stacked(begun)]), self._function("of", [parameters])
+        values = {"begin": stacked(begun), "of": parameters}
+        begin, of = (Buffered(self._function(name, [value])) for name, value in values.items())
+        return begin, of
 
     def begun(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
@@ -131,7 +133,7 @@ class StepFunctions:
         """The held values at the start of a run: those that are nan come from `Held.begin`."""
         if not np.isnan(held).any():
             return held
-        begun = self._expressions[0](time, state, held, parameters).full()[:, 0]
+        (begun,) = self._expressions[0](time, state, held, parameters)
         return np.where(np.isnan(held), begun, held)
 
     def projected(
@@ -139,7 +141,7 @@ class StepFunctions:
     ) -> FloatArray:
         """The state on the manifold, also where plain Newton steps do not lead there."""
         assert self.block.projection is not None
-        values = self._expressions[1](time, state, held, parameters).full()[:, 0]
+        (values,) = self._expressions[1](time, state, held, parameters)
         return self.block.projection.project(state, values)
 
 

@@ -179,7 +179,7 @@ class Manifold:
         step = step_from(moved, start, p)[0]
         left = norm(scale * step / unit)
         if left * left <= PRECISION * size:  # The test of `newton`, without its overhead.
-            return polished(moved, scale * step, lambda x: scale * step_from(x, start, p)[0])
+            return polished(moved, step, lambda x: step_from(x, start, p)[0], scale)
 
         def linearize(z: FloatArray) -> NewtonModel:
             x = scale * z

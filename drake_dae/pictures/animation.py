@@ -182,8 +182,8 @@ def _hex(color: Rgba) -> str:
 def _draw_tube(meshcat: Meshcat, path: str, points: FloatArray, color: Rgba, radius: float) -> None:
     """Draws a thin tube around a line through points, m, shape (k, 3).
 
-    Its vertices are ring after ring of `_SIDES` around the points, and its triangles segment after
-    segment of the line, so that the page can draw it up to a time.
+    Its vertices are rings around the points, and its triangles segment after segment, so that the
+    page can draw it up to a time.
     """
     if len(points) < 2:
         return

@@ -56,10 +56,7 @@ class RunMotion:
 
     @property
     def normals(self) -> FloatArray:
-        """The unit normals of the surfaces in the world, zero without one, (k, constraints, 3).
-
-        They are computed as the forces at rest: without friction a force is along the normal.
-        """
+        """Unit normals of surfaces, zero without one, (k, constraints, 3): of forces at rest."""
         nq, nv = self.model.links.q.numel(), self.model.links.v.numel()
         force = np.array([one for c in self.model.constraints for one in c.is_unilateral], float)
         at_rest = np.pad(self.states[:, :nq], ((0, 0), (0, nv)))
@@ -86,10 +83,7 @@ class ContactPath:
 def follow(
     loop: ClosedLoop, record: Record, context: Context, rate: float = FRAME_RATE
 ) -> RunMotion:
-    """The motion of a robot in a recorded run of a loop, with so many frames per second.
-
-    The context of the loop's diagram has the parameters.
-    """
+    """The motion of a robot in a recorded run, frame by frame; the context has the parameters."""
     plant = loop.plant
     model = plant.robot("a picture of a run")
     parameters = plant.parameters(context_in(plant, context))
@@ -128,10 +122,7 @@ def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
 
 
 def contact_paths(motion: RunMotion) -> list[ContactPath]:
-    """The paths of moving contact points on their surfaces, from the surface's reference point on.
-
-    On a plane these are its coordinates, on a curved surface those of a tangent plane.
-    """
+    """The paths of moving contact points on surfaces; on a curved one in a tangent plane."""
     size = float(np.max(np.abs(motion.points), initial=0.0))
     normals, desired_points, paths = motion.normals, motion.desired_points, []
     for row, constraint in enumerate(motion.acting.constraints):

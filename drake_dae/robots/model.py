@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Self
 
 import casadi as ca
@@ -23,8 +24,12 @@ from drake_dae.robots.loops import LoopState
 from drake_dae.robots.multibody import MultibodyExpressions
 from drake_dae.robots.outputs import ForceOutput, PositionOutput, as_force_outputs, force_rows
 from drake_dae.trace.compiled import Compiled
+from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.numerics import NewtonModel, newton, once, shortest_steps
+
+MOST = 1000
+"""The largest product of unknowns and squared equations whose Newton step is traced."""
 
 
 @checked(ModelError)
@@ -135,11 +140,9 @@ class RobotModel:
         p, of_outputs = self.dae.parameter_symbol, ca.SX.sym("p", self.dae.parameter_symbol.numel())
         h_1 = ca.substitute(h_1, p, of_outputs)
         slopes = {"J": ca.jacobian(phi, links.q), "P": ca.jacobian(h_1, links.q)}
-        self._placing = TracedFunction(
-            f"{name} positions",
-            {"q": links.q, "parameters": p, "parameters of outputs": of_outputs},
-            {"phi": phi, "h_1": h_1, **slopes},
-        )
+        inputs = {"q": links.q, "parameters": p, "parameters of outputs": of_outputs}
+        self._placed = inputs, {"phi": phi, "h_1": h_1, **slopes}
+        self._placing = TracedFunction(f"{name} positions", *self._placed)
         self.balance = StaticBalance(self.dae, links, self.dae.m[h_1.numel() :, :])
         if nominal_positions is None:
             nominal = self._on_constraints(nominal)
@@ -277,12 +280,19 @@ class RobotModel:
         values = self.dae.parameter_vector(parameters)
         own = values if of_outputs is None else self.dae.parameter_vector(of_outputs)
         evaluated = once(lambda q: self._placing(q, values, own))
+        step = self._step if count == len(self.position_signals) else None
 
         def residual(q: FloatArray) -> FloatArray:
             phi, h_1, _, _ = evaluated(q)
             return np.concatenate([phi, h_1[:count] - wanted])  # (58)
 
         def linearize(q: FloatArray) -> NewtonModel | None:
+            if step is not None:
+                step.evaluate(q, values, own, wanted, q)
+                if step.is_valid:
+                    return NewtonModel(
+                        lambda x: step.evaluate(q, values, own, wanted, x)[0].copy(), True
+                    )
             _, _, J, P = evaluated(q)
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)
@@ -296,6 +306,20 @@ class RobotModel:
                 left,
             )
         return q
+
+    @cached_property
+    def _step(self) -> TracedFunction | None:
+        """The shortest Newton step from any point by the matrix of q, if the robot is small."""
+        inputs, outputs = self._placed
+        phi, h_1, J, P = outputs.values()
+        q, rows = self.links.q, phi.numel() + h_1.numel()
+        if not (0 < rows <= q.numel() and rows**2 * q.numel() <= MOST):
+            return None
+        at, wanted = ca.SX.sym("at", q.numel()), ca.SX.sym("outputs", h_1.numel())
+        factors = Factorization(ca.vertcat(J, P).T)
+        step = factors.shortest(ca.substitute(ca.vertcat(phi, h_1 - wanted), q, at))
+        inputs = {**inputs, "outputs": wanted, "at": at}
+        return TracedFunction(f"{self.name} positions", inputs, {"step": -step}, factors.pivot)
 
     @checked(ModelError)
     def rest_state(

@@ -189,12 +189,15 @@ def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
 
 
 def polished(
-    state: FloatArray, step: FloatArray, step_from: Callable[[FloatArray], FloatArray]
+    state: FloatArray,
+    step: FloatArray,
+    step_from: Callable[[FloatArray], FloatArray],
+    scale: FloatArray | float = 1.0,
 ) -> FloatArray:
-    """Returns the state after a step and all following ones, until they are round-off."""
+    """Returns the state after a step and all following ones, over a scale, until round-off."""
     length = norm(step)
     while length > 0.0:
-        state = state + step
+        state = state + scale * step
         step = step_from(state)
         following = norm(step)
         if not following < 0.5 * length:

@@ -206,11 +206,10 @@ def rounded(value: float) -> float:
 
 
 def prediction(loop: ClosedLoop, part: slice | None) -> dict[str, Any] | None:
-    """The data for the prediction of the error: E of e' = E e (30), and its outputs.
+    """E of e' = E e (30) for the browser; None if the errors do not form a linear system.
 
-    "size" is the number of error coordinates, "ends" are the rows of E that contain gains, "gains"
-    (row, column, place) of each gain, "shown" (output, coordinate, whether the derivative is
-    shown), without outputs whose error is zero. None if the errors do not form a linear system.
+    "ends" are the rows of E that contain gains, "gains" (row, column, place) of each, "shown"
+    (output, coordinate, whether its derivative is shown), without outputs whose error is zero.
     """
     law = loop.controller.law
     if not loop.controller.follows or loop.generator is None or part is None:

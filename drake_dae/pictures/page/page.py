@@ -141,11 +141,7 @@ def _page_of(page: str, data: Mapping[str, Any], code: str) -> str:
 
 
 def as_script(data: Any) -> str:
-    """Data as JSON for a script element, escaped so that no text in it ends the script.
-
-    Raises:
-        ModelError: A number is not finite.
-    """
+    """Data as JSON for a script element, escaped so that no text in it ends the script."""
     try:
         text = json.dumps(data, allow_nan=False)
     except ValueError:
@@ -154,11 +150,7 @@ def as_script(data: Any) -> str:
 
 
 class Bench:
-    """What a page shows and changes of a loop, from a context on; `size` is that of the scene in m.
-
-    `code` computes the outputs and their desired values, "change" of the phases of a task, "scene",
-    and "coordinates" of the errors.
-    """
+    """What a page shows and changes of a loop, from a context on; `size` is the scene's in m."""
 
     def __init__(self, loop: ClosedLoop, context: Context | None) -> None:
         """Of a loop, whose free inputs are 0 where they have no value."""
@@ -251,11 +243,7 @@ class Bench:
 
 
 class RobotScene:
-    """The drawn parts of a robot.
-
-    Moving bodies have name, path in Meshcat and frame; `surfaces` move, and `targets` are
-    outputs that are coordinates of a point.
-    """
+    """The drawn parts of a robot: bodies, `surfaces` that move, `targets`: outputs of points."""
 
     def __init__(self, plant: Plant, scene_graph: SceneGraph | None) -> None:
         model, self.plant = plant.robot("a page"), plant
@@ -400,10 +388,7 @@ _ARGUMENTS = (
 
 
 def in_pieces(source: str, longest: int = LONGEST) -> str:
-    """Splits the long functions of a C source of CasADi into pieces, which each calls in turn.
-
-    The array `shared` passes values of a piece to later pieces.
-    """
+    """Splits long functions of C into pieces that pass values on by the array `shared`."""
     return _FUNCTION.sub(lambda function: _split(function, longest), source)
 
 
