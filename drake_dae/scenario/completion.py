@@ -305,7 +305,7 @@ class _Search:
         for row, value, goal in zip(named, postures.at(q).rows[named], begin, strict=True):
             name, unit = self._signals[row].name, self._signals[row].unit
             text = f"{name} comes to {value:.4g} {unit}, and not to {goal:.4g} {unit}"
-            missed += [text] * (abs(goal - value) > 1e-6)
+            missed += [text] * bool(abs(goal - value) > 1e-6)
         text = (
             "the robot cannot start there within its joint limits; the nearest start found has: "
             f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "

@@ -164,9 +164,9 @@ def read_robot(
             start = plant.GetDefaultFloatingBaseBodyPose(link.body())
             joint = RpyFloatingJoint(name, frame_named(plant, _scoped(model, origin)), link)
             plant.AddJoint(joint).SetDefaultPose(start)
-            text = "floating joints have roll, pitch and yaw in the place of a quaternion, whose"
-            text += " length no force keeps at 1, and must not pitch by 90 degrees"
-            mender.tell(text, f"'{name}'")
+            # No force keeps the length of a quaternion at 1.
+            kind = "floating joints have roll, pitch and yaw, _qx, _qy and _qz, in the place of a "
+            mender.tell(f"{kind}quaternion, and must not pitch by 90 degrees", f"'{name}'")
         for (category, kind), items in mender.told.items():
             warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
         facts = dict[JointIndex, Mapping[str, Any]]()
@@ -184,7 +184,7 @@ def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
     mender = Mender(files, robot, None, has_geometry=True, drawn=False)
     with _drake():
         _mended(mender)
-    return list(files.missing), list(mender.lost)
+    return sorted(files.missing), list(mender.lost)
 
 
 def _mended(mender: Mender) -> Path | ModelDirectives:
