@@ -43,6 +43,9 @@ SHAPES = (1.5, 0.5), (0.75, 1.0)
 """p / w and zeta: Butterworth's three poles, and three equal ones, which bear wrong masses with a
 slower estimator. Faster equal ones are stiff: an error of 5 cm at the start took off a contact."""
 
+SLOWEST = 10.0
+"""The least p of equal poles in 1/s: with slower ones friction leaves a mode that hardly decays."""
+
 MODEL_ERROR, EVERY = 1.0, 2.0
 """An unknown force of 1 N appears or turns every 2 s."""
 
@@ -154,6 +157,8 @@ def _free(situation: SensedContact, fast: float | None) -> list[Part]:
     """The predictions for free directions with all rates, and that of an estimator, in 1/s."""
     found = []
     for w, (shape, damping) in product(_rates(situation), SHAPES):
+        if damping == 1.0 and shape * w < SLOWEST:
+            continue
         gains = pole_gains(shape * w, damping, 3)
         rates = DirectionGains((gains[0], gains[1], gains[2]), 0.0, shape * w / 0.75, fast)
         found.append(Part.of(situation, w, rates, False))
