@@ -73,9 +73,11 @@ def contact_normals(model: RobotModel) -> TracedFunction:
 
 MOST_STATES, TOUCHING, BESIDE = 60, 1e-3, 0.02
 """The examined states of a motion. A point is behind a surface from this depth in m, and this
-fraction of its distance from the contact, since tools lie along a surface. A real surface may end
-before the base: a point counts if it is nearer to the contact, or the base is in front and the link
-not next to it."""
+fraction of its distance from the contact, since tools lie along a surface."""
+
+NEARER = 1.1
+"""A real surface may end before the base: a point counts if its distance from the contact is below
+this many times that from the base, or the base is in front and the link not next to it."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,7 @@ class LinkDepths:
             distances = [np.linalg.norm(world - base[:, None], axis=0) for base in bases.T]
             to_base = np.min([np.full(world.shape[1], np.inf), *distances], axis=0)
             depth = function(world, q, parameters).full().ravel() + self._radii
-            near = (to_contact < to_base) | (inner & (of_base.item() < TOUCHING))
+            near = (to_contact < NEARER * to_base) | (inner & (of_base.item() < TOUCHING))
             behind = counts & near & (depth > np.maximum(TOUCHING, BESIDE * to_contact))
             depths[name] = np.maximum.reduceat(np.where(behind, depth, 0.0), starts)
         return depths
