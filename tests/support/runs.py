@@ -9,6 +9,7 @@ import jsonschema
 import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
+from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
@@ -114,9 +115,9 @@ def scenario(name: str, *settings: str) -> Scenario:
     return load_scenario(find_scenario(name), settings)
 
 
-def scenario_model(chosen: Scenario) -> RobotModel:
+def scenario_model(chosen: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
     """The robot model of a scenario: constraints, outputs and actuation."""
-    return completed_model(chosen)[1]
+    return completed_model(chosen, scene_graph)[1]
 
 
 def untagged(data: Any) -> Any:
