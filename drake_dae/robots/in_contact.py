@@ -76,8 +76,8 @@ MOST_STATES, TOUCHING, BESIDE = 60, 1e-3, 0.02
 fraction of its distance from the contact, since tools lie along a surface."""
 
 NEARER = 1.1
-"""A real surface may end before the base: a point counts if its distance from the contact is below
-this many times that from the base, or the base is in front and the link not next to it."""
+"""A real surface may end before the base, and does if the base is behind it: then a point counts if
+it is nearer to the contact than to the base. Else this ratio holds, and not beyond the first link."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,8 @@ class LinkDepths:
             distances = [np.linalg.norm(world - base[:, None], axis=0) for base in bases.T]
             to_base = np.min([np.full(world.shape[1], np.inf), *distances], axis=0)
             depth = function(world, q, parameters).full().ravel() + self._radii
-            near = (to_contact < NEARER * to_base) | (inner & (of_base.item() < TOUCHING))
+            in_front = of_base.item() < TOUCHING
+            near = (to_contact < (NEARER if in_front else 1.0) * to_base) | (inner & in_front)
             behind = counts & near & (depth > np.maximum(TOUCHING, BESIDE * to_contact))
             depths[name] = np.maximum.reduceat(np.where(behind, depth, 0.0), starts)
         return depths
