@@ -77,7 +77,7 @@ fraction of its distance from the contact, since tools lie along a surface."""
 
 NEARER = 1.1
 """A real surface may end before the base, and does if the base is behind it: then a point counts if
-it is nearer to the contact than to the base. Else this ratio holds, and not beyond the first link."""
+it is nearer to the contact than to the base. Else this ratio holds, beyond the first link none."""
 
 
 @dataclass(frozen=True)
