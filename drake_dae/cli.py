@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import redirect_stdout
+from functools import cache
 from importlib import import_module
 from io import TextIOWrapper
 from pathlib import Path
@@ -226,7 +227,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # A signal becomes an exception, so that unfinished files are removed.
         with warnings.catch_warnings(), ending_signals(end_at_once):
-            warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
+            # Each text once: a robot is read again with the loads that an estimator looks for.
+            tell = cache(lambda text: print(f"warning: {text}", file=sys.stderr))
+            warnings.showwarning = lambda message, *_: tell(str(message))
             options = make_parser().parse_args(arguments)
             is_json = getattr(options, "json", False)
             # Drake's modules would make an ImportError of the exception of a signal.
