@@ -154,7 +154,7 @@ def sweep_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 def page_command(options: argparse.Namespace) -> int:
     """Compiles a scenario into a page."""
-    from drake_dae.pictures.page.page import write_page
+    from drake_dae.pictures.page import write_page
 
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)

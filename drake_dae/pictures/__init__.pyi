@@ -2,7 +2,7 @@
 
 from .animation import make_animation as make_animation
 from .film import save_film as save_film
-from .page.page import write_page as write_page
+from .page import write_page as write_page
 from .plots import plot_runs as plot_runs
 
 PLOTS: tuple[str, ...]

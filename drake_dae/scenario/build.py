@@ -30,7 +30,7 @@ from drake_dae.errors import (
     ScenarioError,
     SimulationError,
 )
-from drake_dae.pictures.page.controls import PUSH
+from drake_dae.pictures.page_controls import PUSH
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import KnownWrench, Load, PointOnSurface, RobotModel, ScaledForce
 from drake_dae.running.diagnosis import DivergenceWatch

@@ -12,7 +12,7 @@ from runs import scenario
 from drake_dae import build_scenario, write_page
 from drake_dae.cli import main
 from drake_dae.errors import MachineCodeError
-from drake_dae.pictures.page import page as module
+from drake_dae.pictures import page as module
 from drake_dae.scenario import build_commanded
 from drake_dae.scenario.build import for_rollout, roll_scenario
 

@@ -8,7 +8,7 @@ from runs import scenario
 
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError, WiringError
-from drake_dae.pictures.page.page import Bench, as_script
+from drake_dae.pictures.page import Bench, as_script
 from drake_dae.robots import ConstraintWrenches
 from drake_dae.scenario import build_commanded
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from runs import some
 
-from drake_dae.pictures.page.page import in_pieces
+from drake_dae.pictures.page import in_pieces
 from drake_dae.trace.compiled import generate, library, without_branches
 
 

@@ -25,7 +25,7 @@ from drake_dae.blocks.compose import compose
 from drake_dae.dae import DaeSystem
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import MachineCodeError, ModelError
-from drake_dae.pictures.page.controls import (
+from drake_dae.pictures.page_controls import (
     Numbers,
     controls_of,
     prediction,
