@@ -23,6 +23,13 @@ def test_text_is_aligned_and_not_too_wide(name):
         assert row[rows[0].index("finding") :].startswith(tuple(map(str, Finding)))
 
 
+def test_text_says_where_the_matrices_are_nearest_to_singular():
+    """On x^2 + y^2 = 1 the pendulum's A(x) is the same everywhere, and its B(x) is not."""
+    text = str(analyze(PROBLEMS["pendulum"]().system, count=3))
+    assert "A(x) is the same at all examined states." in text
+    assert "B(x) is nearest to singular at x=" in text
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(["redundant", *PROBLEMS], of=6))
 def test_the_dictionary_is_json(name):

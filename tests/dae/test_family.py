@@ -39,6 +39,13 @@ def chain_that_moves(exogenous, drift=0, **more):
     )
 
 
+def test_parameters_and_their_derivatives_have_the_names_of_their_symbols():
+    system = chain_that_moves(["w"])
+    names = [signal.name for signal in system.parameter_signals]
+    assert names == [str(symbol) for symbol in system.parameter_symbol.elements()]
+    assert names[:3] == ["w", "w'", "w''"]
+
+
 def coupled(gain):
     """Two inputs that an output each has, coupled by numbers."""
     return DaeSystem.from_functions(
