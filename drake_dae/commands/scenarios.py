@@ -1,7 +1,6 @@
 """`drake-dae new`, `analyze`, `sweep`, `page` and `export`: what is made of a scenario."""
 
 import argparse
-import logging
 import shlex
 import sys
 import time
@@ -49,8 +48,6 @@ def new_command(options: argparse.Namespace) -> int:
     check_unwritten([out], options.force)
     if out.exists() and Path(options.robot).exists() and out.samefile(options.robot):
         raise ModelError(f"'{out}' is the robot's own file; name another file for the scenario")
-    # The simulation reports what it leaves out, and Drake's parser warns of every tag.
-    logging.getLogger("drake").setLevel(logging.ERROR)
     began, end = time.perf_counter(), time.process_time() + _CHECKED
 
     def tell(text: str) -> None:

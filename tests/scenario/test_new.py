@@ -1,5 +1,6 @@
 """`drake-dae new`: a scenario for a robot of which only the file is known."""
 
+import logging
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -205,3 +206,5 @@ def test_a_file_that_is_not_there_and_a_tip_without_numbers_are_named(tmp_path, 
     tip = ["--tip", "tool:1,2", "--out", str(tmp_path / "new.yaml")]
     assert main(["new", str(tmp_path / "planar.urdf"), *tip]) == 1
     assert "--tip: " in capsys.readouterr().err
+    # What Drake remarks of a file is heard by this command and after it.
+    assert logging.getLogger("drake").isEnabledFor(logging.WARNING)

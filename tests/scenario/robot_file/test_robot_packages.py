@@ -1,6 +1,5 @@
 """Packages are found where ROS finds them, and a message says where to name the others."""
 
-import warnings
 from pathlib import Path
 
 import pytest
@@ -70,8 +69,7 @@ def test_a_package_beside_that_of_the_file_is_found(tmp_path: Path):
 def test_a_package_in_ros_package_path_is_found(tmp_path: Path, monkeypatch):
     file = away(tmp_path)
     monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path}/none:{tmp_path}/workspace")
-    with warnings.catch_warnings():  # Drake may remark that the first is no folder.
-        warnings.simplefilter("ignore", RobotFileWarning)
+    with pytest.warns(RobotFileWarning, match=f"{tmp_path}/none"):  # It is no folder.
         assert joints(tmp_path, file) == 7
 
 
