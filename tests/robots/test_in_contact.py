@@ -153,6 +153,23 @@ def test_a_link_beside_the_one_in_contact_is_named():
     assert (one.link, one.depth) == ("link4", pytest.approx(depth, rel=1e-9))
 
 
+def test_a_surface_above_the_base_ends_before_what_is_nearer_to_the_base():
+    """The base is 0.1 m behind it, and so is the end of the first link, 0.5 m beside the base."""
+    height = 0.1
+    model = chain(Plane((0.0, 0.0, BASE + height), (0.0, 0.0, 1.0)))
+
+    def touching(far):
+        """The contact is so far from that end: the second link points up, the others down to it."""
+        across, down = np.sqrt(far**2 - height**2), LENGTH - height
+        turn = np.arctan2(down, across)
+        half = np.arccos(np.hypot(across, down) / (2 * LENGTH))
+        return np.diff([0.0, -np.pi / 2, turn - half, turn + half], prepend=0.0)
+
+    assert behind(model, touching(1.05 * LENGTH)) == ()
+    (one,) = behind(model, touching(0.95 * LENGTH))
+    assert (one.link, one.depth) == ("link0", pytest.approx(height + RADIUS, rel=1e-9))
+
+
 @pytest.mark.parametrize(
     ("shape", "lowest"),
     [
