@@ -1,9 +1,9 @@
 """States that an estimator finds from encoders, against its filter, and against runs."""
 
-import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from problems import pushed_mass
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -14,7 +14,6 @@ from scipy.stats import chi2
 
 from drake_dae import (
     DaePlant,
-    DaeSystem,
     Encoders,
     Sampling,
     StateEstimator,
@@ -23,7 +22,6 @@ from drake_dae import (
     build_scenario,
     poles,
 )
-from drake_dae.dae import with_disturbance
 from drake_dae.dae.disturbance import ChainFilter, transition
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import roll_scenario
@@ -34,23 +32,6 @@ T, MASS, FAST, SLOW = 0.01, 2.5, 20.0, 5.0
 RATES = Observing(SLOW, state_rate=FAST)
 
 
-def body(damping: float = 0.0) -> DaeSystem:
-    """M q'' = u - D q' + d, with M = 2.5 kg."""
-    x, none = ca.SX.sym("x", 2), ca.SX(0, 1)
-    system = DaeSystem(
-        x,
-        ca.vertcat(x[1], -damping * x[1]),
-        ca.SX(2, 0),
-        ca.vertcat(0, 1),
-        none,
-        x[0],
-        ca.SX(1, 0),
-        mass_matrix=ca.diag(ca.SX([1.0, MASS])),
-        state_signals=("q", "v"),
-    )
-    return with_disturbance(system, ["v"])
-
-
 def observed(
     push: float,
     duration: float,
@@ -59,7 +40,7 @@ def observed(
     damping: float = 0.0,
 ):
     """What the estimator says of the body under its law, and the body's states, at the samples."""
-    system = body(damping)
+    system = pushed_mass(MASS, damping=damping)
     law = TrackingLaw(system, poles(-2.0))
     builder = DiagramBuilder()
     plant, controller = builder.AddSystem(DaePlant(system)), TrackingController(law)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from arms import error_controlled, numbers, touching
 from numpy.testing import assert_allclose
+from problems import pushed_mass
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -44,28 +45,11 @@ T, RATE, MASS = 0.01, 8.0, 2.5
 STEPS = error_controlled(1e-10)
 
 
-def body() -> DaeSystem:
-    """M q'' = u + d on a spring, with M = 2.5 kg."""
-    x, none = ca.SX.sym("x", 2), ca.SX(0, 1)
-    system = DaeSystem(
-        x,
-        ca.vertcat(x[1], -3.0 * x[0]),
-        ca.SX(2, 0),
-        ca.vertcat(0, 1),
-        none,
-        x[0],
-        ca.SX(1, 0),
-        mass_matrix=ca.diag(ca.SX([1.0, MASS])),
-        state_signals=("q", "v"),
-    )
-    return with_disturbance(system, ["v"])
-
-
 def pushed(
     push: float, delay: float = 0.0, sampling: Sampling | None = None, seed: int = 0, **more
 ):
     """The body under its law with an observer, pushed from the start on."""
-    system = body()
+    system = pushed_mass(MASS, stiffness=3.0)
     law = TrackingLaw(system, poles(-5.0))
     loop = make_closed_loop(
         DaePlant(system),
@@ -120,7 +104,7 @@ def test_noise_of_velocities_comes_through_as_the_filter_says():
 
     4,000 samples, of which 1 / (k_o T) are correlated, tell it to some 5 per cent.
     """
-    system, noise = body(), 0.02
+    system, noise = pushed_mass(MASS, stiffness=3.0), 0.02
     observer = StateEstimator(TrackingLaw(system, poles(-5.0)), Observing(RATE), T)
     builder = DiagramBuilder()
     builder.AddSystem(observer)
@@ -332,7 +316,7 @@ def test_what_pulls_across_the_sliding_is_no_friction(count):
 
 @pytest.mark.slow
 def test_what_cannot_be_observed_is_refused():
-    system = body()
+    system = pushed_mass(MASS, stiffness=3.0)
     with pytest.raises(ModelError, match="'w'"):
         with_disturbance(system, ["w"])
     with pytest.raises(ModelError, match="disturbance"):

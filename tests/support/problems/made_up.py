@@ -6,8 +6,25 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae import DaeSystem, Signal
+from drake_dae.dae import DaeSystem, Signal, with_disturbance
 from problems.problem import Array, Known, Problem, known
+
+
+def pushed_mass(mass: float, stiffness: float = 0.0, damping: float = 0.0) -> DaeSystem:
+    """m q'' = u - k q - d q' + r with the disturbance r."""
+    x, none = ca.SX.sym("x", 2), ca.SX(0, 1)
+    system = DaeSystem(
+        x,
+        ca.vertcat(x[1], -stiffness * x[0] - damping * x[1]),
+        ca.SX(2, 0),
+        ca.vertcat(0, 1),
+        none,
+        x[0],
+        ca.SX(1, 0),
+        mass_matrix=ca.diag(ca.SX([1.0, mass])),
+        state_signals=("q", "v"),
+    )
+    return with_disturbance(system, ["v"])
 
 
 def linear() -> Problem:
