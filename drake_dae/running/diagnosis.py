@@ -278,7 +278,7 @@ class RunWatch:
 def _dependent(
     structure: Structure, matrix: ca.SX, signals: Sequence[Signal], state: FloatArray, limit: float
 ) -> tuple[str, ...]:
-    """The signals whose rows in a matrix depend on each other at a state, but for rows of 0."""
+    """The signals whose rows in a matrix depend on each other at a state, except rows of 0."""
     rows = [i for i in range(matrix.rows()) if matrix[i, :].nnz()]
     margin, part = _margin(structure, matrix[rows, :], state)
     if not margin < limit:

@@ -1,4 +1,4 @@
-"""A point on a surface that rubs or moves, against MultibodyPlant and NumPy alone."""
+"""A point on a surface that has friction or moves, against MultibodyPlant and NumPy alone."""
 
 import numpy as np
 import pytest

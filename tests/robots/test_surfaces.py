@@ -314,7 +314,7 @@ def test_a_ball_is_pushed_off_a_mesh_along_the_normal_of_its_surface(name):
 
 
 def test_a_mesh_is_as_fine_as_its_surface_is_curved():
-    """Its vertices but for the lowest stand on the surface and at the depth below it, by pairs."""
+    """Its vertices except the lowest stand on the surface and at the depth below it, by pairs."""
 
     def vertices(surface, place, size):
         text = surface.layer(place, size, DEPTH).form.source().in_memory().mesh_file.contents()
