@@ -1,6 +1,6 @@
 """Rollouts: runs of a whole diagram without Drake's Simulator."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
@@ -24,6 +24,7 @@ from drake_dae.blocks.failures import (
 from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
 from drake_dae.blocks.stepping import Look, Run, RunEnding, RunProblem, StepSettings
+from drake_dae.blocks.traced_system import context_in
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
 from drake_dae.errors import (
@@ -33,7 +34,7 @@ from drake_dae.errors import (
     NonFiniteError,
     SimulationError,
 )
-from drake_dae.running.diagnosis import IN_ROLLOUT, MANY, RunWatch, warn_if_stiff
+from drake_dae.running.diagnosis import with_cause
 from drake_dae.running.merged_run import NO_EVENTS, MergedRun
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, Seed, program_of
 from drake_dae.running.simulate import check_config
@@ -133,23 +134,18 @@ def rollout(
 
     Warns:
         MachineCodeWarning: Machine code was requested, or would pay, and cannot be made.
-        UserWarning: The loop is stiff, so that explicit steps are many.
     """
     found = run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
     if not isinstance(loop, ClosedLoop) or sum(r.failure is not None for r in found) > DIAGNOSED:
         return found
-    return [diagnosed(loop, one, config) for one in found]
+    return [diagnosed(loop, one) for one in found]
 
 
-def diagnosed(loop: ClosedLoop, rollout: Rollout, config: SimulatorConfig | None = None) -> Rollout:
+def diagnosed(loop: ClosedLoop, rollout: Rollout) -> Rollout:
     """A rollout whose failure says its cause, as that of a simulation does."""
-    if rollout.failure is None or not rollout.record.time.size:
+    if rollout.failure is None:
         return rollout
-    context, record = loop.diagram.CreateDefaultContext(), rollout.record
-    context.SetTime(float(record.time[0]))
-    loop.set_state(context, record["state"][0])
-    watch = RunWatch(loop.diagram, context, config or SimulatorConfig(), 1.0)
-    return replace(rollout, failure=watch.with_cause(rollout.failure))
+    return replace(rollout, failure=with_cause(rollout.failure, loop.plant, loop.controller))
 
 
 def run_loop(
@@ -173,6 +169,11 @@ def run_loop(
     """
     config = config or SimulatorConfig()
     check_config(config)
+
+    def stop(rows: Callable[[], FloatArray]) -> bool:
+        return look is not None and look(lambda after: program.record(moments, rows(), after))
+
+    code, lanes = None, None
     with MAKING:
         program = program_of(loop)
         choice: Compiled = program.choice if compiled is None else compiled
@@ -183,61 +184,42 @@ def run_loop(
         if not (moments[1:] > moments[:-1]).all():
             raise ModelError("times must be strictly increasing")
         problems = program.problems(starts, parameters, moments, seeds)
-        is_shared = program.shares(problems.parameters, len(problems.state))
-
-    def stop(rows: Callable[[], FloatArray]) -> bool:
-        return look is not None and look(lambda after: program.record(moments, rows(), after))
-
-    seconds = len(problems.state) * float(np.ptp(moments)) if lasting is None else lasting
-    runs = dict[int, Run]()
-    for of in (True, False):
-        indices = np.flatnonzero(is_shared == of)
-        if not indices.size:
-            continue
-        with MAKING:
-            kind = program.shared if of else program
-            some = kind.some(problems, indices)
-            settings = StepSettings.of(config, kind.functions, stop)
-            calls: float = STAGES_PER_SECOND
-            if settings.tableau is not None:
-                calls = len(settings.tableau.b) / settings.longest
-            calls = seconds * (calls + sum(1.0 / rate.period for rate in kind.functions.rates))
-            lanes, code = None, kind.machine_code(choice, calls, lasting is None)
-            if code is not None and look is None and indices.size >= SEVERAL:
-                lanes = kind.machine_code(choice, FASTER * calls, lasting is None, several=True)
-        if code is not None and lanes is not None:
-            made = run_several(lanes, code, some, settings)
-        elif code is not None:
-            made = run_alone(code, some, settings)
-        elif kind.drake is not None:
-            of_run = [None if seeds is None else seeds[i] for i in indices.tolist()]
-            given = config, choice, settings.look
-            made = [_run_by_drake(kind, some.run(i), s, *given) for i, s in enumerate(of_run)]
-        else:
-            each = map(some.run, range(indices.size))
-            made = [run_interpreted(kind.functions, one, settings) for one in each]
-        runs |= zip(indices.tolist(), made, strict=True)
-    if settings.tableau is None:
-        most = max(runs.values(), key=lambda run: run.steps)
-        if most.steps >= MANY and most.ending is RunEnding.DONE:  # A failure says its own cause.
-            context = program.context.Clone()
-            program.put(context, most.time, most.state, most.held, problems.run(0).parameters)
-            pace = (most.time - moments[0]) / most.steps
-            warn_if_stiff(program.diagram, context, pace, most.steps, IN_ROLLOUT)
+        count, own = len(problems.state), problems
+        kind, problems = program.for_numbers(problems)
+        functions, settings = kind.functions, StepSettings.of(config, kind.functions, stop)
+        calls: float = STAGES_PER_SECOND
+        if settings.tableau is not None:
+            calls = len(settings.tableau.b) / settings.longest
+        calls += sum(1.0 / rate.period for rate in functions.rates)
+        calls *= count * float(np.ptp(moments)) if lasting is None else lasting
+        code = kind.machine_code(choice, calls, lasting is None)
+        if code is not None and look is None and count >= SEVERAL:
+            lanes = kind.machine_code(choice, FASTER * calls, lasting is None, several=True)
+    each = [problems.run(i) for i in range(count)]
+    if code is not None and lanes is not None:
+        runs = run_several(lanes, code, problems, settings)
+    elif code is not None:
+        runs = run_alone(code, problems, settings)
+    elif kind.drake is None:
+        runs = [run_interpreted(functions, one, settings) for one in each]
+    else:
+        given = [{}] * count if seeds is None else [kind.seeds(seed) for seed in seeds]
+        more = config, choice, settings.look
+        runs = [_run_by_drake(kind, one, s, *more) for one, s in zip(each, given, strict=True)]
     found = []
-    for i in range(len(problems.state)):
+    for i, run in enumerate(runs):
         failure = None
-        if runs[i].ending not in (RunEnding.DONE, RunEnding.PAUSED):
+        if run.ending not in (RunEnding.DONE, RunEnding.PAUSED):
             with MAKING:
-                failure = _failure(program, problems.run(i).parameters, runs[i])
-        found.append(Rollout(runs[i].steps, failure, program, moments, runs[i].rows))
+                failure = _failure(program, own.run(i).parameters, run)
+        found.append(Rollout(run.steps, failure, program, moments, run.rows))
     return found
 
 
 def _run_by_drake(
     program: RolloutProgram,
     problem: RunProblem,
-    seed: Seed | None,
+    seeds: Mapping[str, int],
     config: SimulatorConfig,
     compiled: Compiled,
     look: Look,
@@ -245,10 +227,9 @@ def _run_by_drake(
     """A run of a diagram with a plant that only Drake steps, by its Simulator."""
     context, rows = program.context.Clone(), list[FloatArray]()
     program.put(context, float(problem.times[0]), problem.state, problem.held, problem.parameters)
-    for number, source in enumerate(program.sources.values()):
-        if (chosen := program.seed_of(seed, number)) is not None:
-            generator = RandomGenerator(chosen)
-            source.SetRandomContext(source.GetMyMutableContextFromRoot(context), generator)
+    for name, seed in seeds.items():
+        source = program.sources[name]
+        source.SetRandomContext(context_in(source, context), RandomGenerator(seed))
     assert program.drake is not None
     program.drake.ExecuteInitializationEvents(program.drake.GetMyMutableContextFromRoot(context))
     ending, error = RunEnding.DONE, None
@@ -274,8 +255,6 @@ def _run_by_drake(
 
 def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> SimulationError:
     """The exception that the same run raises in Drake's Simulator."""
-    if isinstance(run.error, SimulationError):
-        return run.error
     if run.error is not None:
         return cannot_go_on(run.time, run.held[program.drake_state], str(run.error))
     plants = [s for s in program.composed.states if isinstance(s, Plant)]
@@ -319,8 +298,7 @@ def _reason(
     try:
         diagram.EvalTimeDerivatives(context)
         for port in program.ports.values():
-            system = port.get_system()
-            port.Eval(context if system is diagram else system.GetMyContextFromRoot(context))
+            port.Eval(context)
         if program.functions.rates:
             simulator = Simulator(diagram, context)
             simulator.Initialize(NO_EVENTS)
@@ -329,5 +307,5 @@ def _reason(
     except SimulationError as error:
         return error
     except (DrakeDaeError, RuntimeError):
-        return None
+        pass
     return None

@@ -367,17 +367,17 @@ def roll_scenario(
         seeds["force_noise"] = sensors.force.seed
     if sensors.encoders is not None:
         seeds[parts.ENCODER_NOISE] = parts.encoder_seed(sensors.encoders.seed)
-    watch, due = DivergenceWatch(loop.plant, scenario.duration), time.perf_counter() + PERIOD
+    watch, due = DivergenceWatch(loop.plant), time.perf_counter() + PERIOD
     seen: float | None = None
     failure: SimulationError | None = None
 
-    def diverges(rows: Record, is_last: bool = False) -> bool:
+    def diverges(rows: Record) -> bool:
         nonlocal seen, due, failure
         due = time.perf_counter() + PERIOD
         if not scenario.judgement.may_diverge and failure is None and rows.time.size:
             seen = float(rows.time[-1])
             try:
-                watch.look(rows, is_last=is_last)
+                watch.look(rows)
             except SimulationError as error:
                 failure = error
         return failure is not None
@@ -388,10 +388,10 @@ def roll_scenario(
     times = rollout_times(scenario, loop.plant.time_step)
     more: dict[str, Any] = {"config": scenario.integrator, "seeds": [seeds], "lasting": lasting}
     (rollout,) = run_loop(loop, start, parameters, times, look=watched, **more)
-    if diverges(rollout.record.after(seen), is_last=rollout.failure is None):
+    if diverges(rollout.record.after(seen)):
         assert failure is not None
         rollout = rollout.ended(failure)
-    return diagnosed(loop, rollout, scenario.integrator)
+    return diagnosed(loop, rollout)
 
 
 class Commanded(NamedTuple):
