@@ -3,37 +3,24 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common import RandomGenerator
-from pydrake.systems.analysis import Simulator, SimulatorConfig
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.blocks.failures import (
-    PACE_STEPS,
-    cannot_go_on,
-    endless_steps,
-    no_step_leads_on,
-    off_manifold,
-    spoilt_step,
-)
+from drake_dae.blocks.failures import cannot_go_on
 from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
 from drake_dae.blocks.stepping import Look, Run, RunEnding, RunProblem, StepSettings
-from drake_dae.blocks.traced_system import context_in
+from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
-from drake_dae.errors import (
-    DrakeDaeError,
-    InconsistentStateError,
-    ModelError,
-    NonFiniteError,
-    SimulationError,
-)
+from drake_dae.errors import DrakeDaeError, ModelError, SimulationError
 from drake_dae.running.diagnosis import with_cause
 from drake_dae.running.merged_run import NO_EVENTS, MergedRun
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, Seed, program_of
@@ -46,8 +33,9 @@ STAGES_PER_SECOND = 500  # An estimate of the evaluations in a simulated second 
 # The time that runs side by side save per evaluation, over that of an interpreted one.
 FASTER = 0.05
 LOOKED = 64  # The rows after which a run by Drake looks whether it diverges, or is to stop.
-# The most failed runs of one call whose cause is looked for, which takes up to a second each.
-DIAGNOSED = 8
+# The most failed runs of one call that Drake's Simulator continues to tell why they failed, and for
+# how long under error control, in s.
+DIAGNOSED, FARTHEST = 8, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,17 +123,8 @@ def rollout(
     Warns:
         MachineCodeWarning: Machine code was requested, or would pay, and cannot be made.
     """
-    found = run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
-    if not isinstance(loop, ClosedLoop) or sum(r.failure is not None for r in found) > DIAGNOSED:
-        return found
-    return [diagnosed(loop, one) for one in found]
-
-
-def diagnosed(loop: ClosedLoop, rollout: Rollout) -> Rollout:
-    """A rollout whose failure says its cause, as that of a simulation does."""
-    if rollout.failure is None:
-        return rollout
-    return replace(rollout, failure=with_cause(rollout.failure, loop.plant, loop.controller))
+    more: dict[str, Any] = {"config": config, "compiled": compiled, "seeds": seeds}
+    return run_loop(loop, starts, parameters, times, **more)
 
 
 def run_loop(
@@ -206,14 +185,17 @@ def run_loop(
         given = [{}] * count if seeds is None else [kind.seeds(seed) for seed in seeds]
         more = config, choice, settings.look
         runs = [_run_by_drake(kind, one, s, *more) for one, s in zip(each, given, strict=True)]
-    found = []
-    for i, run in enumerate(runs):
-        failure = None
-        if run.ending not in (RunEnding.DONE, RunEnding.PAUSED):
-            with MAKING:
-                failure = _failure(program, own.run(i).parameters, run)
-        found.append(Rollout(run.steps, failure, program, moments, run.rows))
-    return found
+    failures = [
+        i for i, run in enumerate(runs) if run.ending not in (RunEnding.DONE, RunEnding.PAUSED)
+    ]
+    with MAKING:
+        reasons = {
+            i: _failure(program, runs[i], own.run(i).parameters, config, n < DIAGNOSED)
+            for n, i in enumerate(failures)
+        }
+    return [
+        Rollout(run.steps, reasons.get(i), program, moments, run.rows) for i, run in enumerate(runs)
+    ]
 
 
 def _run_by_drake(
@@ -253,59 +235,37 @@ def _run_by_drake(
     return Run(table, ending, context.get_time(), state, held, run.steps, error=error)
 
 
-def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> SimulationError:
-    """The exception that the same run raises in Drake's Simulator."""
-    if run.error is not None:
-        return cannot_go_on(run.time, run.held[program.drake_state], str(run.error))
+def _failure(
+    program: RolloutProgram,
+    run: Run,
+    parameters: FloatArray,
+    config: SimulatorConfig,
+    is_diagnosed: bool,
+) -> SimulationError:
+    """What Drake's Simulator says where a run ended, from its last accepted state on."""
     plants = [s for s in program.composed.states if isinstance(s, Plant)]
     state = run.state[program.composed.states[plants[0]] if plants else slice(program.num_states)]
-    trial = None
-    if np.isfinite(run.trial_time) and run.trial is not None:
-        trial = _reason(program, parameters, run.trial_time, run.trial, run.held)
-    match run.ending:
-        case RunEnding.OFF_MANIFOLD:
-            try:
-                program.functions.projected(run.time, run.state, run.held, parameters)
-            except InconsistentStateError as error:
-                return off_manifold(run.time, state, error)
-        case RunEnding.SLOW:
-            return endless_steps(program.name, PACE_STEPS, run.mark, run.time, state)
-        case RunEnding.SPOILT:
-            return spoilt_step(program.name, run.time, run.next, state, trial)
-        case RunEnding.STUCK if trial is not None:
-            return no_step_leads_on(program.name, run.time, state, trial)
-        case RunEnding.STUCK:
-            reason = "no step, however short, is as accurate as it should be"
-            return cannot_go_on(run.time, state, reason, "choose a lower accuracy")
-    found = _reason(program, parameters, run.time, run.state, run.held) or trial
-    return found or NonFiniteError(
-        f"{program.name}: a signal has no value at t = {run.time:.6g} s", run.time, state
-    )
-
-
-def _reason(
-    program: RolloutProgram,
-    parameters: FloatArray,
-    time: float,
-    state: FloatArray,
-    held: FloatArray,
-) -> SimulationError | None:
-    """What the diagram as wired raises at these values, or within its next samples; or None."""
-    if not np.isfinite(state).all():
-        return None
-    context, diagram = program.context.Clone(), program.diagram
-    program.put(context, time, state, held, parameters)
+    if run.error is not None:
+        return cannot_go_on(run.time, run.held[program.drake_state], str(run.error))
+    reason = f"{program.name} has no value, or no step is as accurate as it should be"
+    error = cannot_go_on(run.time, state, reason, "choose other steps")
+    if not is_diagnosed:
+        return error
+    context, diagram, loop = program.context.Clone(), program.diagram, program.loop
+    simulator = Simulator(diagram, context)
+    ApplySimulatorConfig(config, simulator)  # It sets the time, too.
+    program.put(context, run.time, run.state, run.held, parameters)
+    seconds = FARTHEST if config.use_error_control else 2.0 * config.max_step_size
     try:
-        diagram.EvalTimeDerivatives(context)
+        simulator.Initialize(NO_EVENTS)
+        for system in program.composed.systems:
+            if isinstance(system, TracedSystem):
+                system.begin_run(context_in(system, context))
         for port in program.ports.values():
             port.Eval(context)
-        if program.functions.rates:
-            simulator = Simulator(diagram, context)
-            simulator.Initialize(NO_EVENTS)
-            simulator.AdvanceTo(time + 1e-6 * min(r.period for r in program.functions.rates))
-            simulator.AdvancePendingEvents()
-    except SimulationError as error:
-        return error
-    except (DrakeDaeError, RuntimeError):
-        pass
-    return None
+        simulator.AdvanceTo(run.time + seconds)
+    except SimulationError as raised:
+        error = raised
+    except RuntimeError as raised:
+        error = cannot_go_on(run.time, state, str(raised))
+    return with_cause(error, loop.plant, loop.controller) if isinstance(loop, ClosedLoop) else error

@@ -34,7 +34,7 @@ from drake_dae.pictures.page_controls import PUSH
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import KnownWrench, Load, PointOnSurface, RobotModel, ScaledForce
 from drake_dae.running.diagnosis import DivergenceWatch
-from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
+from drake_dae.running.rollout import Rollout, run_loop, start_values
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
 from drake_dae.scenario.gains import advised, estimates_all, estimating_all, estimating_friction
@@ -391,7 +391,7 @@ def roll_scenario(
     if diverges(rollout.record.after(seen)):
         assert failure is not None
         rollout = rollout.ended(failure)
-    return diagnosed(loop, rollout)
+    return rollout
 
 
 class Commanded(NamedTuple):
