@@ -134,10 +134,10 @@ class SignalLimits:
 
     def of_record(self, record: Record) -> FloatArray:
         """The rows of s in a record of the system."""
-        signals = (record["state"], record["control"], record["constraint_force"])
-        p = self.system.parameter_values
-        rows = [self._values(*row, p)[0] for row in zip(*signals, strict=True)]
-        return np.array(rows).reshape(len(rows), len(self.signals))
+        rows = (record[name].T for name in ("state", "control", "constraint_force"))
+        # CasADi evaluates all columns at once.
+        values: FloatArray = self._values.function(*rows, self.system.parameter_values)[0].full()
+        return values.T
 
     def ranges(self, times: FloatArray, values: FloatArray) -> tuple[SignalRange, ...]:
         """The range of each signal along rows of s, with times."""

@@ -178,16 +178,17 @@ def _sensed_gains(
         roughness = _SHARE * float(np.max(efforts)) if efforts.size else 1.0
     bounds = {} if law.largest_errors is None else vars(law.largest_errors)
     errors = {f"{name}_error": most for name, most in bounds.items() if most is not None}
-    bare = ""
-    try:
-        best = advised_gains(sensed, roughness, **errors)
-    except GainError:
-        # Gains of a contact of half the stiffness are stable up to twice that.
-        softer = replace(sensed, stiffness=stiffness / 2.0)
-        if settles_along(sensed) or not settles_along(softer):
-            raise
-        best = advised_gains(softer, roughness, **errors)
-        bare = ". A contact that is stiffer than stated may be unstable: sample more often"
+    bare, softer = "", sensed
+    if not settles_along(sensed):
+        # Gains of the stiffest softer contact that has some: they are stable up to twice that, and
+        # slow beside the oscillation of a stiffer one, which its own dissipation damps.
+        softened = (replace(sensed, stiffness=stiffness / 2.0**i) for i in range(1, 11))
+        softer = next(filter(settles_along, softened), sensed)
+        bare = (
+            f". They are those of {softer.stiffness:.2g} N/m, since none are stable with a margin "
+            "at the stated stiffness: sample more often"
+        )
+    best = advised_gains(softer, roughness, **errors)
     return best, (
         ". These gains are the best for one direction alone, "
         f"{1e3 * best.noise_error:.2g} mm and {best.noise_force:.2g} N rms by noise, and a change "

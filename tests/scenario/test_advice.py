@@ -14,7 +14,7 @@ from drake_dae.dae.disturbance import estimated_within
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import build
 from drake_dae.scenario import parts as parts
-from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.build import build_completed, roll_scenario
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.gains import (
     advised,
@@ -253,12 +253,28 @@ def test_gains_without_a_margin_are_told():
     def at_stiffness(stiffness: float) -> Completed:
         return advice(two_link(*sensed, f"plant.stiffness={stiffness}"))
 
-    stable, bare = at_stiffness(2e5), at_stiffness(4e5)
-    assert "stiffer than stated" not in stable.notes[0]
-    assert "stiffer than stated" in bare.notes[0]
+    stable, bare = at_stiffness(2e5), at_stiffness(8e5)
+    assert "stated stiffness" not in stable.notes[0]
+    assert "those of 2e+05 N/m" in bare.notes[0]
     assert bare.scenario.law.gains == stable.scenario.law.gains
-    found = find_feasibility(two_link(*sensed, "plant.stiffness=8e5"))
-    assert any(re.search(r"law\.gains: .*8e\+05", problem) for problem in found.problems)
+
+
+@pytest.mark.slow
+def test_gains_without_a_margin_run():
+    """16 times stiffer than what has a margin: it oscillates by 2.7 rad in a sample.
+
+    Measured: 0.79 mm and 0.25 N. The dissipation of Drake's contact damps it.
+    """
+    sensed = "sensors.encoders={position_noise: 1.0e-5}", "sampling={period: 4.0e-3, delay: 4.0e-3}"
+    plant = "plant=!CompliantContact {time_step: 4.0e-3, stiffness: 3.0e+6, friction: 0.3}"
+    completed, loop = build_completed(
+        load_scenario("two_link_wall", ["law={}", plant, *sensed, "duration=4"])
+    )
+    run = roll_scenario(completed.scenario, loop, start_scenario(completed.scenario, loop))
+    assert run.failure is None
+    record, late = run.record, run.record.time > 2.0
+    errors = (record["controlled_output"] - record["desired_output"])[late]
+    np.testing.assert_array_less(np.sqrt(np.mean(errors**2, axis=0)), [1.5e-3, 0.5])
 
 
 def test_the_stiffness_of_a_patch_is_that_at_10_newtons():
