@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from found_places import found_off
 from programs import loaded
 
 from drake_dae import load_scenario
@@ -23,6 +22,27 @@ def example():
         if not module.DATA.exists():
             pytest.skip("pip install example-robot-data")
         yield module
+
+
+def found_off(chosen, loop, record, rows, at):
+    """The distances of the estimated surface from the true one along the way of a tool, m.
+
+    The estimate is that of the row `at`, and the way that of the rows `rows`.
+    """
+    dae = loop.controller.law.system
+    distance = dae.trace("distance", {"value": dae.k})
+    own, sought = chosen.plant.parameters, chosen.estimator.parameters
+    places = {name: np.array(own[name]) for name in sought if name in own}
+    truth = dae.with_values(places).parameter_values
+    names = [signal.name.partition("[")[0] for signal in record.signals["identified"].signals]
+    found = {n: record["identified"][at][[m == n for m in names]] for n in places}
+    values = dae.with_values(found).parameter_values
+    return np.array(
+        [
+            distance(x, values)[0].item() - distance(x, truth)[0].item()
+            for x in record["state"][rows]
+        ]
+    )
 
 
 def rolled(example, *settings):
