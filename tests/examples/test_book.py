@@ -11,7 +11,7 @@ import pytest
 from book.generated import public_names, uses
 from book.notebooks import has_code, notebook
 from book.pages import BOOK, PageError, blocks, compare, pages, run_page
-from browser import BUDGET, CHROMIUM, OPTIONS, low_contrast
+from browser import BUDGET, CHROMIUM, dumped, low_contrast
 
 SLOW = {
     "explanations/force.md",
@@ -124,7 +124,7 @@ def test_site_is_made_and_loads_nothing_from_outside(tmp_path):
         for page in ("index", "how_to/gains", "reference/errors", "tutorials/first_contact"):
             assert low_contrast(tmp_path / "site" / f"{page}.html") == {}, page
         for question, answer in QUESTIONS.items():
-            assert f"how_to/{answer}.html" in first_of_search(tmp_path / "site", question, tmp_path)
+            assert f"how_to/{answer}.html" in first_of_search(tmp_path / "site", question)
 
 
 QUESTIONS = {
@@ -137,10 +137,8 @@ QUESTIONS = {
 """What a user looks for -> the page that answers it."""
 
 
-def first_of_search(site: Path, question: str, folder: Path) -> list[str]:
+def first_of_search(site: Path, question: str) -> list[str]:
     """The addresses of the first three pages that the search of the site finds."""
     address = f"{(site / 'search.html').as_uri()}?q={quote(question)}"
-    words = [CHROMIUM, *OPTIONS, f"--user-data-dir={folder / 'profile'}", BUDGET, "--dump-dom"]
-    done = subprocess.run([*words, address], capture_output=True, text=True, timeout=600)
-    found = re.findall(r'<li class="kind-\w+"><a href="([^"?#]*)', done.stdout)
+    found = re.findall(r'<li class="kind-\w+"><a href="([^"?#]*)', dumped(address, BUDGET))
     return list(dict.fromkeys(found))[:3]

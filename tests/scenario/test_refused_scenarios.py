@@ -82,7 +82,17 @@ REFUSED = {
         "constraints.0=!WeldedFrames {frame_a: world, frame_b: tool}": "outputs: |6|2",
         ("outputs=[]", f"{PIN} yz}}"): "constraints: |'pin.y'",
         (f"{PIN} x}}", "outputs.0=!SurfaceCoordinates {constraint: pin}"): "outputs.0: |'pin'",
-        # Outputs, gains, actuation and force.
+        "constraints.0.surface=!ImplicitSurface {function: z - q}": (
+            "constraints.0.surface: |column 5|'q'"
+        ),
+        "constraints.0.surface=!MeasuredSurface {size: [1, 1], heights: [[0, 1], [1]]}": (
+            "constraints.0.surface.heights: |length"
+        ),
+        # Outputs, gains, actuation, force, and what the plant has alone.
+        ("sensors.force={}", "law.force_gain=1"): "time_constant",
+        ("sensors.force={sample_period: 0.01}", "law.force_gain=2"): "sensors.force: ",
+        "plant.disturbances=[{frame: tol, force: [0, 0, 1]}]": "plant.disturbances.0: |'tol'",
+        "plant.payloads=[{frame: tool, mass: 0}]": "plant.payloads.0: |mass",
         ("outputs=[]", "forces=[]", "references={}"): "outputs: |2",
         "outputs.0.axes=xz": "outputs: |1|2|(tool.x, tool.z)",
         "judgement.tolerances={tool.q: 1}": "judgement.tolerances: |'tool.q'",
@@ -120,6 +130,15 @@ REFUSED = {
     },
     "seven_joint_pipe": {
         "outputs.0=!PointCoordinates {frame: tool, axes: yz}": "pipe.a|!SurfaceCoordinates"
+    },
+    "three_fingers": {
+        "robot.free=[objct]": "robot.free: |'objct'",
+        "forces.1.frame=obj": "forces.1: |'grip2'|'obj'",
+        "forces.2=!ForceCombination {weights: {grip1.f: 1}, name: a}": "forces.2: |'grip1.f'",
+    },
+    "seven_joint_moving_plate": {
+        "exogenous={plate.positio: []}": "exogenous: |'plate.positio'",
+        "exogenous={plate.rpy: []}": "plate.rpy: |3|0",
     },
     "rod": {"constraints.0.length=0": "constraints.0: |'rod.length'"},
     "ball": {
