@@ -22,7 +22,7 @@ from drake_dae.dae.advised_gains import EVERY, MODEL_ERROR, RAMP, Part, settles_
 from drake_dae.dae.law_model import damping_gains
 from drake_dae.dae.margins import ContactMargins
 from drake_dae.dae.one_direction import DirectionGains
-from drake_dae.errors import DrakeDaeError, GainError, ModelError, ScenarioError
+from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import JointFriction, Plane, PointOnSurface, RobotModel, velocities_are_rates
 from drake_dae.scenario import parts

@@ -1,6 +1,6 @@
 """The friction of contacts as an estimator sees it, and their first break-away."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import accumulate
 
@@ -70,6 +70,8 @@ _SHARP = 10.0
 """Friction of a contact that gives way is taken as that of a motion faster by this factor: it is
 fully developed from v_s / 10 on. An ideal contact has the friction of the model."""
 
+_STEPS = 4  # of Newton's method for the impulse of friction: it converges in two or three
+
 LITTLE = 1e-9  # the least normal force, in N, by which is divided
 
 
@@ -92,6 +94,32 @@ class ContactTerms:
     slides: ca.SX
     sticks: ca.SX
     valid: ca.SX
+
+
+def slowed(
+    velocity: ca.SX, planes: Sequence[ca.SX], impulses: ca.SX, move: Callable[[ca.SX], ca.SX]
+) -> ca.SX:
+    """The velocity after the impulses of friction c = mu lambda T of contacts in a sample.
+
+    As in Drake's discrete plants friction acts against the sliding velocity w+ after it:
+
+        w+ = w - c A n,    n = w+ / |w+|,    A = T^T M^-1 T,
+
+    so that (s 1 + c A) n = w with |n| = 1 and s = |w+|, or at rest with s = 0 and |n| < 1, found
+    by Newton's steps for s from below (More and Sorensen, 1983). Friction against w would turn a
+    light tool about from sample to sample: its A is large. `move` is M^-1.
+    """
+    for plane, impulse in zip(planes, impulses.elements(), strict=True):
+        c, moves = ca.fmax(impulse, 0), move(plane)  # Of a noisy sensor it may be negative.
+        w, A = ca.mtimes(plane.T, velocity), c * ca.mtimes(plane.T, moves)
+        s = ca.fmax(ca.norm_2(w) - ca.trace(A), 0)
+        for _ in range(_STEPS):
+            factors = PositiveDefiniteFactorization(A + (s + LITTLE) * ca.SX.eye(w.numel()))
+            n = factors.solve(w)
+            size, slope = ca.norm_2(n), ca.fmax(ca.dot(n, factors.solve(n)), LITTLE)
+            s = ca.fmax(s + size**2 / slope * (size - 1.0), 0)
+        velocity = velocity - c * ca.mtimes(moves, n / ca.fmax(size, 1.0))
+    return velocity
 
 
 class Contacts:
@@ -121,9 +149,9 @@ class Contacts:
 
     def is_lost(self, v: ca.SX) -> ca.SX:
         """1 for each contact that is lost, shape (c, 1)."""
-        return self._pressing(v) < self._observing.least_force
+        return self.pressing(v) < self._observing.least_force
 
-    def _pressing(self, v: ca.SX) -> ca.SX:
+    def pressing(self, v: ca.SX) -> ca.SX:
         """The normal force of each contact."""
         return ca.vertcat(ca.SX(0, 1), *(v[i] for i in self._observation.frictions.values()))
 
@@ -230,7 +258,7 @@ class Contacts:
         friction = self._observation.friction.function
         wanted, actual = (friction(each, v, parameters)[1] for each in (goal, now))
         towards, forces = (self.developed(each, v, parameters) for each in (goal, now))
-        pressing = ca.fmax(ca.fabs(self._pressing(v)), LITTLE)
+        pressing = ca.fmax(ca.fabs(self.pressing(v)), LITTLE)
         is_moved, sticks = wanted > self._least_speed, slid == 0
         ahead = -ca.mtimes(towards.T, error) > CLEAR * ca.sqrt(ca.sum1(towards**2 * squares).T)
         aside = [

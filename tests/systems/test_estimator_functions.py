@@ -13,6 +13,7 @@ from drake_dae import JointFriction, RobotModel, StateEstimator, TrackingLaw, po
 from drake_dae.dae import with_disturbance
 from drake_dae.dae.disturbance import ChainFilter
 from drake_dae.systems import Observing
+from drake_dae.systems.break_away import slowed
 
 T = 1e-3
 RATES = Observing(20.0, force_rate=5.0, state_rate=100.0)
@@ -248,3 +249,28 @@ def test_friction_of_joints_is_compensated_at_wanted_velocities_where_it_is_esti
     disturbance = function(*values).full().ravel()[len(named) :]
     # The law cancels d v of its model itself; this changes it to d times the wanted velocity.
     assert_allclose(disturbance, [-viscous[0] * (wanted - now)[0], 0.0], rtol=1e-6, atol=1e-9)
+
+
+def test_friction_acts_against_the_velocity_after_it():
+    """w+ = w - c A w+ / |w+|, or rest where c bears more than A^-1 w; 4 steps leave 1e-3 of w.
+
+    A is that of planes in space, of rank 2, in one direction up to a hundred times that of another.
+    """
+    random, rests = np.random.default_rng(0), 0
+    v, T, c = ca.SX.sym("v", 5), ca.SX.sym("T", 5, 3), ca.SX.sym("c")
+    step = ca.Function("step", [v, T, c], [slowed(v, [T], c, lambda columns: columns)])
+    for _ in range(300):
+        plane = random.normal(size=(5, 2)) * 10.0 ** random.uniform(-0.5, 0.5, 2)
+        plane = plane @ np.linalg.qr(random.normal(size=(3, 2)))[0].T
+        velocity, size = random.normal(size=5), 10.0 ** random.uniform(-4.0, 2.0)
+        after = step(velocity, plane, size).full().ravel()
+        w, slides = plane.T @ velocity, plane.T @ after
+        needed = np.linalg.lstsq(plane.T @ plane, w, rcond=1e-10)[0]
+        scale = np.linalg.norm(w)
+        if np.linalg.norm(needed) < 0.999 * size:
+            assert np.linalg.norm(slides) < 1e-3 * scale
+            rests += 1
+        elif np.linalg.norm(needed) > 1.001 * size:
+            n = slides / np.linalg.norm(slides)
+            assert np.linalg.norm(w - size * plane.T @ plane @ n - slides) < 1e-3 * scale
+    assert 30 < rests < 270
