@@ -125,6 +125,18 @@ def vector(
     return array
 
 
+def each(what: str, value: Any, size: int) -> FloatArray:
+    """One finite number for each of `size` items, shape (size,), from these or from one for all.
+
+    Raises:
+        ModelError: The numbers have another shape, or one of them is not finite.
+    """
+    array = numbers(what, value)
+    if array.shape not in ((), (size,)) or not all_finite(array):
+        raise ModelError(f"{what} must be a finite number or shape ({size},), got {brief(value)}")
+    return np.broadcast_to(array, (size,)).copy()
+
+
 def check_whole_number(what: str, value: Any, least: int) -> None:
     """Checks that a value is a whole number of at least `least`.
 
@@ -135,14 +147,10 @@ def check_whole_number(what: str, value: Any, least: int) -> None:
         raise ModelError(f"{what} must be a whole number from {least}, got {brief(value)}")
 
 
-def check_axes(name: str, axes: str) -> None:
-    """Checks that a text consists of distinct letters of "xyz".
-
-    Raises:
-        ModelError: A letter is another one, or occurs twice, or there is none.
-    """
-    if not axes or any(a not in "xyz" for a in axes) or len(set(axes)) != len(axes):
-        raise ModelError(f"{name} must be distinct letters of x, y, z, got '{axes}'")
+def check_axes(name: str, axes: str, letters: str = "xyz") -> None:
+    """Checks that a text has at least one letter, each once; ModelError if not."""
+    if not axes or not set(axes) <= set(letters) or len(set(axes)) != len(axes):
+        raise ModelError(f"{name} must be distinct letters of {', '.join(letters)}, got '{axes}'")
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:

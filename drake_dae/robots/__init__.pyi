@@ -70,6 +70,8 @@ from .shapes import ImplicitSurface as ImplicitSurface
 from .shapes import Plane as Plane
 from .shapes import Sphere as Sphere
 from .shapes import Torus as Torus
+from .surface import LETTERS as LETTERS
+from .surface import Letter as Letter
 from .surface import Pair as Pair
 from .surface import PosedShape as PosedShape
 from .surface import Surface as Surface

@@ -1,6 +1,7 @@
 """Joints at which a loop is cut, as constraints."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, pi
@@ -16,11 +17,9 @@ from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint import Constraint, ConstraintSet
 from drake_dae.robots.couplings import rotation_error
-from drake_dae.robots.links import Application, Frames, Kinematics, Links, Reaction
+from drake_dae.robots.links import Application, Frames, Kinematics, Links
 from drake_dae.robots.plant_frames import without_round_off
-from drake_dae.robots.surface import Letter, Vector
-
-LETTERS = "xyz"
+from drake_dae.robots.surface import LETTERS, Letter, Vector
 
 
 @dataclass(frozen=True)
@@ -101,8 +100,8 @@ class LoopJoint(Constraint):
 
     @property
     @abstractmethod
-    def held_axes(self) -> tuple[str, str]:
-        """The axes of F along which M cannot move, and about which it cannot turn, as letters."""
+    def held_axes(self) -> tuple[Sequence[str], Sequence[str]]:
+        """The axes of F along which M cannot move, and about which it cannot turn."""
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -205,9 +204,9 @@ class RevoluteLoopJoint(LoopJoint):
         return (low + high) / 2 if np.isfinite(low) and np.isfinite(high) else 0.0
 
     @property
-    def held_axes(self) -> tuple[str, str]:
-        across = LETTERS.replace(self.axis, "")
-        return (across, "") if self.planar else (LETTERS, across)
+    def held_axes(self) -> tuple[Sequence[str], Sequence[str]]:
+        across = [letter for letter in LETTERS if letter != self.axis]
+        return (across, ()) if self.planar else (LETTERS, across)
 
     def residual(self, frames: Frames) -> ca.SX:
         R_FM, p_FM = self._relative(frames)
@@ -256,11 +255,9 @@ class PrismaticLoopJoint(LoopJoint):
             raise ModelError(f"normal must be another axis than '{self.axis}', the joint's own")
 
     @property
-    def held_axes(self) -> tuple[str, str]:
-        across = LETTERS.replace(self.axis, "")
-        if self.normal is None:
-            return across, LETTERS
-        return across.replace(self.normal, ""), self.normal
+    def held_axes(self) -> tuple[Sequence[str], Sequence[str]]:
+        across = [letter for letter in LETTERS if letter not in (self.axis, self.normal)]
+        return across, LETTERS if self.normal is None else (self.normal,)
 
     def residual(self, frames: Frames) -> ca.SX:
         R_FM, p_FM = self._relative(frames)
@@ -286,26 +283,20 @@ class LoopState:
 
     def __init__(self, constraints: ConstraintSet, links: Links) -> None:
         joints = [joint for joint in constraints.constraints if isinstance(joint, LoopJoint)]
-        kinematics = links.kinematics()
-        coordinates = [joint.coordinates(kinematics) for joint in joints]
-        rates = [kinematics.derivative(c) for c in coordinates]
-        position = kinematics.value(ca.vertcat(ca.SX(0, 1), *coordinates))
-        rate = kinematics.value(ca.vertcat(ca.SX(0, 1), *rates))
+        kinematics, unit = links.kinematics(), ca.SX.sym("unit", len(joints))
+        own = ca.vertcat(ca.SX(0, 1), *[joint.coordinates(kinematics) for joint in joints])
+        own_rate = kinematics.derivative(own)
+        position, rate = kinematics.value(own), kinematics.value(own_rate)
         self.state = ca.vertcat(position, rate)
         named = [signal for joint in joints for signal in joint.coordinate_signals]
         self.signals = (*named, *(signal.derivative(1) for signal in named))
-        fastest = [
-            inf if joint.velocity_limit is None else joint.velocity_limit for joint in joints
-        ]
         low, high = np.reshape([joint.limits for joint in joints], (-1, 2)).T
+        fastest = [joint.velocity_limit or inf for joint in joints]
         self.limits = np.append(low, np.negative(fastest)), np.append(high, fastest)
         driven = [i for i, joint in enumerate(joints) if joint.motor]
-        efforts = [joints[i].effort_limit for i in driven]
-        self.effort_limits = np.array([inf if effort is None else effort for effort in efforts])
-        unit, total = ca.SX.sym("unit", len(joints)), Reaction(ca.SX(links.v.numel(), 1))
-        for i, own in enumerate(rates):
-            total += kinematics.reaction(unit[i] * own)
-        columns = total.map(lambda part: ca.jacobian(part, unit))
+        self.effort_limits = np.array([joints[i].effort_limit or inf for i in driven])
+        reaction = kinematics.reaction(ca.dot(unit, own_rate))
+        columns = reaction.map(lambda part: ca.jacobian(part, unit))
         self.columns = links.generalized_force(kinematics, columns)
         forces = [joint.force(position[i], rate[i]) for i, joint in enumerate(joints)]
         self.force = ca.sparsify(ca.mtimes(self.columns, ca.vertcat(ca.SX(0, 1), *forces)))

@@ -98,6 +98,7 @@ def _check_whole(grid: FloatArray) -> None:
 
 
 Letter = Literal["x", "y", "z"]
+LETTERS: tuple[Letter, ...] = ("x", "y", "z")
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]
 

@@ -85,7 +85,7 @@ class TiltFromNormalForm:
     """
 
     constraint: str
-    axis: str
+    axis: robots.Letter
     components: str = ""
 
     def make(self, constraints: Sequence[Constraint]) -> PositionOutput:

@@ -182,8 +182,6 @@ def test_two_motors_on_one_joint_share_its_torque_by_their_weights():
         (lambda: textbook(mass_matrix=ca.DM([[1, 2], [2, 1]])), "M.q."),
         (lambda: textbook(mass_matrix=ca.DM.eye(3)), r"mass_matrix.*\(3, 3\)"),
         (lambda: textbook(actuation_matrix=np.eye(3)), r"actuation_matrix.*\(3, 3\)"),
-        (lambda: textbook(position_limits=([0.0], [1.0])), r"position_limits.*\(2,\)"),
-        (lambda: textbook(velocity_limits=([1, 1], [1, 2])), "velocity_limits"),
         (lambda: textbook(constraints=[WALL, WALL], outputs=[]), "wall"),
         (lambda: textbook(outputs=[ExpressionOutput(lambda links: links.q, [Signal("a")])]), "2"),
     ],
