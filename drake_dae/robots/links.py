@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae import Parameter, Signal, as_expression, signals
+from drake_dae.dae import Parameter, Signal, as_expression, places_of, signals
 from drake_dae.dae.signals import is_symbol
 from drake_dae.errors import ModelError
 
@@ -36,10 +36,7 @@ class Frames(ABC):
 
 def position_index(frames: Frames, name: str) -> int:
     """The index of a name among the generalized positions; ModelError if there is none."""
-    names = [signal.name for signal in frames.position_signals]
-    if name not in names:
-        raise ModelError(unknown_name("joint position", name, names))
-    return names.index(name)
+    return places_of("joint position", [name], frames.position_signals)[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,10 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
-from drake_dae.dae import Signal, as_expression
+from drake_dae.dae import Signal, as_expression, places_of
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint import Constraint, ConstraintSet
-from drake_dae.robots.links import Kinematics, Links, position_index
+from drake_dae.robots.links import Kinematics, Links
 from drake_dae.robots.surface import Letter, Vector
 from drake_dae.trace.expressions import length_of, result_of
 
@@ -165,11 +165,11 @@ class JointPositions(PositionOutput):
     joints: Sequence[str]
 
     def expression(self, links: Links) -> ca.SX:
-        return links.q[[position_index(links, joint) for joint in self.joints]]
+        return links.q[places_of("joint position", self.joints, links.position_signals)]
 
     def signals(self, links: Links) -> tuple[Signal, ...]:
-        units = {signal.name: signal.unit for signal in links.position_signals}
-        return tuple(Signal(joint, units[joint]) for joint in self.joints)
+        places = places_of("joint position", self.joints, links.position_signals)
+        return tuple(links.position_signals[place] for place in places)
 
 
 @checked(ModelError)

@@ -1,4 +1,4 @@
-"""Blades, wheels and balls: nonholonomic constraints."""
+"""Blades and wheels: nonholonomic constraints."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -7,15 +7,13 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
-from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint import Constraint
-from drake_dae.robots.links import Application, Frames, Kinematics
-from drake_dae.robots.surface import Surface, Vector, unit_vector
+from drake_dae.robots.links import Application, Kinematics
+from drake_dae.robots.surface import Vector, unit_vector
 from drake_dae.trace.expressions import length_of
 
 
@@ -139,90 +137,3 @@ class RollingWheel(_RestingPoint):
         velocity = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
         point = kinematics.position(self.frame, self.center) - lever
         return point, velocity, ca.horzcat(f, ca.cross(n, f)) if self.holds_side else f
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class RollingBall(_RestingPoint):
-    """A ball rolls on a surface without slip or separation:
-
-        phi(q) = distance(p_W) - radius,    0 = t_1 . v_c,  0 = t_2 . v_c,
-        v_c = p_W' - radius (w x n),
-
-    with the center p_W, the angular velocity w, the unit normal n at the center, and the tangents
-    t_1, which is `along` projected onto the tangent plane and normalized, and t_2 = n x t_1. The
-    first row restricts positions (r = 2), the others velocities alone (r = 1): together the ball's
-    material point at the contact rests. The constraint forces are the normal force and the two
-    rolling frictions in N that the surface exerts on the ball at the contact; the normal force is
-    unilateral, and the surface gets the opposite. The ball can spin about n. The parameters
-    "<name>.position" and "<name>.radius" are the position of the surface and the radius.
-
-    The surface must have an exact distance function, as planes, spheres, cylinders and tori do.
-    Check that friction can provide the rolling forces.
-
-    Attributes:
-        frame: Name of a frame on the ball.
-        surface: A surface fixed in the world with an exact distance function.
-        radius: The ball's radius, m, positive.
-        center: Its center in the frame, m, shape (3,).
-        along: A direction in the world that is never parallel to the normal, of any length, shape
-            (3,).
-        name: The name of the constraint, the prefix of its forces and its parameters.
-    """
-
-    frame: str
-    surface: Surface
-    radius: float
-    center: Vector = (0.0, 0.0, 0.0)
-    along: Vector = (1.0, 0.0, 0.0)
-    name: str = "ball"
-    force_units: ClassVar = {"force": "N", "friction_1": "N", "friction_2": "N"}
-    residual_units: ClassVar = {"distance": "m", "slip_1": "m/s", "slip_2": "m/s"}
-    is_unilateral: ClassVar[tuple[bool, ...]] = (True, False, False)
-
-    def __post_init__(self) -> None:
-        if not self.surface.has_exact_distance:
-            raise ModelError(
-                f"a ball cannot roll on {type(self.surface).__name__}, whose distance is right to "
-                "first order only; use Plane, Sphere, Cylinder or Torus"
-            )
-        object.__setattr__(self, "along", unit_vector("along", self.along))
-        super().__post_init__()
-
-    @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (
-            Parameter(f"{self.name}.position", np.array(self.surface.position), "m"),
-            Parameter(f"{self.name}.radius", np.array([self.radius]), "m", positive=True),
-        )
-
-    @property
-    def coordinate_signals(self) -> tuple[Signal, ...]:
-        coordinates = self.surface.coordinate_signals
-        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in coordinates)
-
-    def residual(self, frames: Frames) -> ca.SX:
-        return self.surface.distance(self._offset(frames)) - self.parameters[1].symbol
-
-    def coordinates(self, frames: Frames) -> ca.SX:
-        return self.surface.coordinates(self._offset(frames))
-
-    def surface_at(self, values: FloatArray) -> Surface:
-        return self.surface
-
-    def placement(self, values: FloatArray) -> RigidTransform:
-        return RigidTransform(values[:3])
-
-    def _offset(self, frames: Frames) -> ca.SX:
-        """The center relative to the surface's position, m, shape (3, 1)."""
-        return frames.position(self.frame, self.center) - self.parameters[0].symbol
-
-    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX, ca.SX]:
-        n, along = self.surface.unit_normal(self._offset(kinematics)), ca.SX(self.along)
-        across = along - n * ca.dot(n, along)
-        first = across / length_of(across)
-        lever = self.parameters[1].symbol * n
-        spin = kinematics.angular_velocity(self.frame)
-        velocity = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
-        point = kinematics.position(self.frame, self.center) - lever
-        return point, velocity, ca.horzcat(n, first, ca.cross(n, first))

@@ -118,7 +118,7 @@ class Surface(ABC):
     3. `coordinates` are coordinates along the surface, one row for each of `coordinate_signals`;
        with the distance they determine a point, except at poles. A surface may have none.
     4. `has_exact_distance` says whether the distance is exact also off the surface: its gradient
-       has length one there. Balls roll only on such surfaces.
+       has length one there.
     5. `picture` is the surface around a point. By default it is drawn from its distance; surfaces
        with a known shape return that.
     6. `shape` are named numbers of its form that may vary; most surfaces have none. `shaped` is the
@@ -205,7 +205,9 @@ class Surface(ABC):
         place, ends = np.asarray(center, float), []
         even = self._patch(place, size, EVEN, EVEN)
         _check_whole(even)
-        for axis, length in enumerate(self._lengths(size)):
+        for axis, length in enumerate(
+            2 * [size] if self.extent is None else np.ptp(self.extent, 0)
+        ):
             bend = np.linalg.norm(np.diff(even, 2, axis=axis), axis=-1).max() / 8.0
             needed = np.ceil((EVEN.size - 1) * (bend / _SAG) ** 0.5)
             if not (rim := _RIM * depth / length) < 0.25:
@@ -217,10 +219,6 @@ class Surface(ABC):
             inner = np.linspace(rim - 0.5, 0.5 - rim, int(np.clip(needed, _LEAST, _MOST)) + 1)
             ends.append(np.concatenate([[-0.5], inner, [0.5]]))
         return layer_below(self._patch(place, size, *ends), self._linear(), depth)
-
-    def _lengths(self, size: float) -> Pair:
-        """The lengths of a patch along rows and columns in m."""
-        return size, size
 
     def _linear(self) -> TracedFunction:
         """A point -> its distance, and the gradient of the distance."""

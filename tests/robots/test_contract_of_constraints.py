@@ -43,7 +43,6 @@ from drake_dae.robots import (
     ConstraintSet,
     LoopState,
     MultibodyExpressions,
-    RollingBall,
     WeldedFrames,
 )
 from drake_dae.trace.functions import TracedFunction
@@ -156,12 +155,6 @@ def wheel_at(place, _):
     return RollingWheel("tip", 0.2, (0.1, 1.0, 0.2), POINT, (0.1, -0.2, 0.9))
 
 
-def rolling_at(place, _):
-    """Inside a sphere of radius 0.5 m, the ball's center 0.3 m from its center."""
-    center = place @ np.array(POINT) + [0.1, 0.2, 0.2]
-    return RollingBall("tip", Sphere(tuple(center), 0.5, inside=True), 0.2, POINT)
-
-
 def flat_at(place, _):
     """The tip's own axis (0, 3, 4) is the normal of a plane somewhere."""
     normal = place.rotation() @ np.array([0.0, 0.6, 0.8])
@@ -209,7 +202,6 @@ MEMBERS = {
     "rough": (rough_at, {"tip", "world"}),
     "blade": (blade_at, {"tip", "world"}),
     "wheel": (wheel_at, {"tip", "world"}),
-    "rolling": (rolling_at, {"tip", "world"}),
     "flat": (flat_at, {"tip", "world"}),
     "upright": (upright_at, {"tip", "world"}),
     "tilted": (tilted_at, {"tip", "world"}),
@@ -441,7 +433,7 @@ def test_a_push_drives_the_residual_up():
         up = rows.reshape(-1) @ np.linalg.solve(links.plant.CalcMassMatrix(context), columns)
         assert up > 0.0
     rough = {"frictional", "rough"}
-    assert found == {"plane", "ball", "saddle", "rolling", *rough}
+    assert found == {"plane", "ball", "saddle", *rough}
 
 
 def pole():

@@ -54,7 +54,6 @@ class Closure:
     - "plane": point B is in the plane through A with the normal `direction`, fixed in the world,
       with Coulomb's `friction` while it slides; the force with its friction, N. The plane may move
       along its normal, with `road`: its velocity, m/s, and acceleration, m/s^2, at the stated time.
-    - "ball": a ball of the radius `size` with the center B rolls on that plane; the force, N.
     - "gear": the position of `body_b` is `size` times that of `body_a` (one joint each); the moment
       on body B, N m, which gives `size` times the opposite on A.
     """
@@ -147,7 +146,6 @@ def force_names(closure: Closure) -> list[str]:
         "hinge": ["mx", "my", "mz", "fx", "fy", "fz"],
         "distance": ["thrust"],
         "plane": ["fx", "fy", "fz"],
-        "ball": ["fx", "fy", "fz"],
         "gear": ["moment"],
     }
     return [f"{closure.name}.{name}" for name in kinds[closure.kind]]
