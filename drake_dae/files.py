@@ -2,7 +2,6 @@
 
 import errno
 import os
-import stat
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -25,11 +24,8 @@ MOST_RECORDED = 1 << 31
 
 def open_file(path: str | Path) -> BinaryIO:
     """Opens a file for reading: no pipe, which may block for ever, and no device without end."""
-    mode = os.stat(path).st_mode
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    if not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, "it is a pipe or a device, and no file", str(path))
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OSError(errno.EINVAL, "it is a directory, a pipe or a device", str(path))
     return open(path, "rb")
 
 
