@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -110,37 +110,48 @@ def analyze(
             raise ModelError(f"{system.name}: {name} is that of a reference, and none is given")
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
-    random = np.random.default_rng(seed)
-    chosen = (
-        ExaminedStates.drawn(system, count, random)
-        if states is None
-        else ExaminedStates.given(system, states, random)
-    )
-    analysis = examine(system, chosen)
+    analysis = examine(system, states, count, seed)
     if reference is None or times is None:
         return _at_rest(analysis)
     return along(analysis, reference, times, start, period, exogenous)
 
 
-def examine(system: DaeSystem, chosen: ExaminedStates | None = None) -> Analysis:
+def examine(
+    system: DaeSystem, states: ArrayLike | None = None, count: int = COUNT, seed: int = SEED
+) -> Analysis:
     """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics."""
-    if chosen is None:
-        chosen = ExaminedStates.drawn(system, COUNT, np.random.default_rng(SEED))
-    given_states = chosen.guesses[: chosen.num_given]
+    random, size = np.random.default_rng(seed), system.num_states
+    if states is None:
+        nominal, given = system.nominal_state, np.zeros((0, size))
+        drawn = system.spread_around(nominal) * random.standard_normal((count, size))
+        guesses = np.vstack([nominal, nominal + drawn])
+    else:
+        given = numbers(f"{system.name}: states", states)
+        if not given.size or given.shape[1:] != (size,) or not np.all(np.isfinite(given)):
+            raise ModelError(
+                f"{system.name}: states must be finite numbers of shape (k, {size}), got {states!r}"
+            )
+        around = system.spread_around(given[0]) * random.standard_normal((NEIGHBOURS, size))
+        guesses = np.vstack([given, given[0] + 0.1 * around])
     try:
         check_system(system)
-        constrained, around = examine_constraints(system, chosen.guesses)
+        constrained, around_them = examine_constraints(system, guesses)
     except AssumptionError as error:
-        where = chosen.describe(len(chosen.guesses), "state")
-        tried = given_states if chosen.num_given else chosen.guesses
+        tried = given if len(given) else guesses
+        place = "as given" if len(given) else "around the nominal one"
+        where = f"{count_of(len(tried), 'state')} {place}"
         return Analysis(system, where, tried, _assumptions((), [error.violation]))
-    samples = around
-    if chosen.num_given:
+    samples = around_them
+    if len(given):
         # Degrees are decided also at states around them, margins only at them.
-        samples = Samples(around.manifold, given_states)
-        _check_consistent(samples.manifold, given_states, samples.states)
-    where = chosen.describe(len(samples.states), "consistent state")
-    return _examine(constrained, around, samples, where, search=not chosen.num_given)
+        samples = Samples(around_them.manifold, given)
+        _check_consistent(samples.manifold, given, samples.states)
+        where = f"{count_of(len(given), 'consistent state')} as given"
+    else:
+        where = f"{count_of(len(samples.states), 'consistent state')} around the nominal one"
+        if left_out := len(guesses) - len(samples.states):
+            where += f"; {left_out} more were outside the domain or off N*"
+    return _examine(constrained, around_them, samples, where, search=not len(given))
 
 
 def _at_rest(analysis: Analysis) -> Analysis:
@@ -272,43 +283,6 @@ def _assumptions(
         violation = violated.get(number)
         result.append(Assumption(number, statement, finding, margin, reason, violation))
     return tuple(result)
-
-
-@dataclass(frozen=True, eq=False)
-class ExaminedStates:
-    """The states that an analysis starts from: random ones, or those given and some beside."""
-
-    guesses: FloatArray
-    num_given: int
-
-    @classmethod
-    def drawn(cls, system: DaeSystem, count: int, random: np.random.Generator) -> ExaminedStates:
-        nominal = system.nominal_state
-        drawn = nominal + system.spread_around(nominal) * random.standard_normal(
-            (count, nominal.size)
-        )
-        return cls(np.vstack([nominal, drawn]), 0)
-
-    @classmethod
-    def given(
-        cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
-    ) -> ExaminedStates:
-        rows = numbers(f"{system.name}: states", states)
-        shape = (len(rows) if rows.ndim else 0, system.num_states)
-        if rows.shape != shape or not rows.size or not np.all(np.isfinite(rows)):
-            raise ModelError(
-                f"{system.name}: states must be finite numbers of shape (k, {system.num_states}), "
-                f"got {states!r}"
-            )
-        around = system.spread_around(rows[0]) * random.standard_normal((NEIGHBOURS, shape[1]))
-        return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows))
-
-    def describe(self, count: int, noun: str) -> str:
-        if self.num_given:
-            return f"{count_of(self.num_given, noun)} as given"
-        left_out = len(self.guesses) - count
-        missing = f"; {left_out} more were outside the domain or off N*" if left_out else ""
-        return f"{count_of(count, noun)} around the nominal one{missing}"
 
 
 def _check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:

@@ -1,4 +1,4 @@
-"""Tables and paragraphs as plain text and as Markdown."""
+"""Tables and paragraphs as plain text."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,12 +32,6 @@ class Table:
             lines.append("  ".join(aligned).rstrip())
         return "\n".join(lines)
 
-    def to_markdown(self) -> str:
-        """Returns the table in Markdown, for notebooks and GitHub."""
-        marks = [":--" if self._is_left(i) else "--:" for i in range(len(self.head))]
-        rows = [self.head, marks, *self.rows]
-        return "\n".join("| " + " | ".join(t.replace("|", "\\|") for t in r) + " |" for r in rows)
-
 
 def digits(value: float) -> str:
     """Formats a number with four digits; round-off is 0."""
@@ -59,13 +53,6 @@ def to_text(parts: Sequence[Part]) -> str:
         )
 
     return "\n\n".join(map(text, parts))
-
-
-def to_markdown(parts: Sequence[Part]) -> str:
-    """Joins parts to Markdown."""
-    return "\n\n".join(
-        part.to_markdown() if isinstance(part, Table) else "  \n".join(part) for part in parts
-    )
 
 
 def count_of(number: int, noun: str) -> str:
