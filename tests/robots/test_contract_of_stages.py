@@ -76,14 +76,6 @@ def test_equations_are_of_the_state_the_load_and_parameters(stage):
     assert all(np.all(np.isfinite(part)) for part in rest)
 
 
-def test_it_can_be_attached_again(stage):
-    first, second = stage.attach(links()), stage.attach(links())
-    assert not ca.depends_on(first.state, second.state)
-    for one, other in zip(first.parameters, second.parameters, strict=True):
-        assert one.name == other.name
-        np.testing.assert_array_equal(one.value, other.value)
-
-
 def test_only_a_shaft_can_be_driven_by_a_stage(stage):
     behind = [stage, MEMBERS["motors"]]
     if stage.attach(links()).shaft is None:
