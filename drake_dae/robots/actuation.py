@@ -118,11 +118,13 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
 
 def full_matrix(name: str, value: ArrayLike, size: int) -> FloatArray:
     """A finite number, a diagonal or a matrix, as a matrix of shape (size, size)."""
-    if np.ndim(value) < 2:
-        return np.diag(each(name, value, size))
     array = numbers(name, value)
-    if array.shape != (size, size) or not np.all(np.isfinite(array)):
-        raise ModelError(f"{name} must be finite and of shape ({size}, {size}), got {value!r}")
+    if array.shape in ((), (size,)):
+        return np.diag(np.broadcast_to(array, (size,)))
+    if array.shape != (size, size):
+        raise ModelError(
+            f"{name} must be a finite number, shape ({size},) or ({size}, {size}), got {value!r}"
+        )
     return array
 
 
