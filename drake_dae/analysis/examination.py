@@ -14,7 +14,6 @@ from drake_dae.analysis.tables import count_of
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, numbers
 from drake_dae.dae import (
-    ConstraintStructure,
     DaeSystem,
     Manifold,
     RankMargin,
@@ -111,8 +110,6 @@ def analyze(
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
     analysis = examine(system, states, count, seed)
-    if reference is None or times is None:
-        return _at_rest(analysis)
     return along(analysis, reference, times, start, period, exogenous)
 
 
@@ -120,6 +117,7 @@ def examine(
     system: DaeSystem, states: ArrayLike | None = None, count: int = COUNT, seed: int = SEED
 ) -> Analysis:
     """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics."""
+    # The states.
     random, size = np.random.default_rng(seed), system.num_states
     if states is None:
         nominal, given = system.nominal_state, np.zeros((0, size))
@@ -135,92 +133,25 @@ def examine(
         guesses = np.vstack([given, given[0] + 0.1 * around])
     try:
         check_system(system)
-        constrained, around_them = examine_constraints(system, guesses)
+        constrained, nearby = examine_constraints(system, guesses)
     except AssumptionError as error:
         tried = given if len(given) else guesses
         place = "as given" if len(given) else "around the nominal one"
         where = f"{count_of(len(tried), 'state')} {place}"
         return Analysis(system, where, tried, _assumptions((), [error.violation]))
-    samples = around_them
+    samples = nearby
     if len(given):
         # Degrees are decided also at states around them, margins only at them.
-        samples = Samples(around_them.manifold, given)
+        samples = Samples(nearby.manifold, given)
         _check_consistent(samples.manifold, given, samples.states)
         where = f"{count_of(len(given), 'consistent state')} as given"
     else:
         where = f"{count_of(len(samples.states), 'consistent state')} around the nominal one"
         if left_out := len(guesses) - len(samples.states):
             where += f"; {left_out} more were outside the domain or off N*"
-    return _examine(constrained, around_them, samples, where, search=not len(given))
 
-
-def _at_rest(analysis: Analysis) -> Analysis:
-    """Adds the zero dynamics at rest, where there is a structure."""
-    if analysis.structure is None:
-        return analysis
-    dynamics, states = ZeroDynamics(analysis.system, structure=analysis.structure), analysis.states
-    stability = dynamics.stability(states[0])
-    equilibria = _equilibria(dynamics, stability, states, None)
-    return replace(analysis, zero_dynamics=stability, equilibria=equilibria)
-
-
-def along(
-    analysis: Analysis,
-    reference: Callable[[float], FloatArray],
-    times: ArrayLike,
-    start: ArrayLike | None,
-    period: float | None,
-    exogenous: Sequence[Reference],
-) -> Analysis:
-    """Adds what `analyze` says along a reference, where there is a structure."""
-    system, states, structure = analysis.system, analysis.states, analysis.structure
-    if structure is None:
-        return analysis
-    dynamics = ZeroDynamics(system, structure=structure)
-    guess = states[0] if start is None else start
-    motion = dynamics.motion(reference, times, guess, exogenous=exogenous)
-    rest, outputs = states[0], None
-    if motion.times.size:
-        # The state does not determine outputs with mu_i = 0: they are taken from the start of the
-        # reference.
-        rest = motion.states[0]
-        outputs = structure.layout.values(reference(float(motion.times[0])))
-    stability = dynamics.stability(rest, outputs=outputs)
-    stability_along = None
-    if dynamics.dimension and period is not None:
-        stability_along = dynamics.stability_along(reference, motion, period, exogenous=exogenous)
-    contact_margin_along = None
-    if system.frictional_contacts and motion.times.size:
-        contacts = ContactMargins(system, structure.elimination.constraint_matrix)
-        contact_margin_along = contacts.along(motion.times, motion.states, motion.parameters)
-    return replace(
-        analysis,
-        motion=motion,
-        contact_margin_along=contact_margin_along,
-        zero_dynamics=stability,
-        equilibria=_equilibria(dynamics, stability, states, outputs),
-        zero_dynamics_along=stability_along,
-    )
-
-
-def _equilibria(
-    dynamics: ZeroDynamics, stability: Stability, states: FloatArray, outputs: FloatArray | None
-) -> tuple[Stability, ...]:
-    """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
-    if not dynamics.dimension:
-        return ()
-    judged: tuple[Stability, ...] = ()
-    if stability.state is not None and len(dynamics.equilibria([stability.state], None, outputs)):
-        judged, states = (stability,), np.vstack([stability.state, states])
-    others = dynamics.equilibria(states, outputs=outputs)[len(judged) :]
-    return (*judged, *(dynamics.stability(state, outputs=outputs) for state in others))
-
-
-def _examine(
-    constrained: ConstraintStructure, around: Samples, samples: Samples, where: str, search: bool
-) -> Analysis:
-    """Examines degrees at some samples and margins at others, without zero dynamics."""
-    system, elimination = samples.system, constrained.elimination
+    # The constraints.
+    elimination, search = constrained.elimination, not len(given)
     results: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
     margins: dict[int, RankMargin] = {}
     violations: list[Violation] = []
@@ -243,10 +174,12 @@ def _examine(
         if system.frictional_contacts:
             margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
             results["contact_margin"] = margins_of_contacts.over(samples, search)
+
+    # The outputs.
     without_law = why_no_law(system)
     if regular and not without_law:
         try:
-            structure = examine_outputs(constrained, around)
+            structure = examine_outputs(constrained, nearby)
         except AssumptionError as error:
             violations.append(error.violation)
         else:
@@ -260,6 +193,54 @@ def _examine(
                 results["structure"] = structure
     assumptions = _assumptions(satisfied, violations, margins, without_law)
     return Analysis(system, where, samples.states, assumptions, **results)
+
+
+def along(
+    analysis: Analysis,
+    reference: Callable[[float], FloatArray] | None = None,
+    times: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    period: float | None = None,
+    exogenous: Sequence[Reference] = (),
+) -> Analysis:
+    """Adds zero dynamics, and what `analyze` says along a reference, if there is a structure."""
+    system, states, structure = analysis.system, analysis.states, analysis.structure
+    if structure is None:
+        return analysis
+    dynamics, found = ZeroDynamics(system, structure=structure), dict[str, Any]()
+    rest, outputs = states[0], None
+    if reference is not None and times is not None:
+        guess = states[0] if start is None else start
+        motion = found["motion"] = dynamics.motion(reference, times, guess, exogenous=exogenous)
+        if motion.times.size:
+            # The state does not determine outputs with mu_i = 0: they are taken from the start of
+            # the reference.
+            rest = motion.states[0]
+            outputs = structure.layout.values(reference(float(motion.times[0])))
+            if system.frictional_contacts:
+                contacts = ContactMargins(system, structure.elimination.constraint_matrix)
+                margin = contacts.along(motion.times, motion.states, motion.parameters)
+                found["contact_margin_along"] = margin
+        if dynamics.dimension and period is not None:
+            found["zero_dynamics_along"] = dynamics.stability_along(
+                reference, motion, period, exogenous=exogenous
+            )
+    stability = dynamics.stability(rest, outputs=outputs)
+    equilibria = _equilibria(dynamics, stability, states, outputs)
+    return replace(analysis, zero_dynamics=stability, equilibria=equilibria, **found)
+
+
+def _equilibria(
+    dynamics: ZeroDynamics, stability: Stability, states: FloatArray, outputs: FloatArray | None
+) -> tuple[Stability, ...]:
+    """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
+    if not dynamics.dimension:
+        return ()
+    judged: tuple[Stability, ...] = ()
+    if stability.state is not None and len(dynamics.equilibria([stability.state], None, outputs)):
+        judged, states = (stability,), np.vstack([stability.state, states])
+    others = dynamics.equilibria(states, outputs=outputs)[len(judged) :]
+    return (*judged, *(dynamics.stability(state, outputs=outputs) for state in others))
 
 
 def _assumptions(

@@ -81,8 +81,8 @@ class SignalRange:
     @property
     def share(self) -> float:
         """How much of the half range between its limits is used; nan without both limits."""
-        with np.errstate(invalid="ignore"):
-            return float(1.0 - np.float64(2.0 * self.room) / (self.high - self.low))
+        width = self.high - self.low
+        return 1.0 - 2.0 * self.room / width if np.isfinite(width) else np.nan
 
     @property
     def excess(self) -> Excess | None:

@@ -19,16 +19,15 @@ class Table:
     rows: Sequence[Sequence[str]]
     left: int = 1
 
-    def _is_left(self, column: int) -> bool:
-        return column < self.left or not self.head[column]
-
     def __str__(self) -> str:
         rows = [self.head, *self.rows]
         widths = [max(len(row[i]) for row in rows) for i in range(len(self.head))]
         lines = []
         for row in rows:
-            cells = enumerate(zip(row, widths, strict=True))
-            aligned = [t.ljust(w) if self._is_left(i) else t.rjust(w) for i, (t, w) in cells]
+            cells = enumerate(zip(row, widths, self.head, strict=True))
+            aligned = [
+                t.ljust(w) if i < self.left or not h else t.rjust(w) for i, (t, w, h) in cells
+            ]
             lines.append("  ".join(aligned).rstrip())
         return "\n".join(lines)
 
