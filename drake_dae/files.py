@@ -92,9 +92,8 @@ def check_unwritten(files: Iterable[Path], force: bool) -> None:
     there = [path for path in files if os.path.lexists(path)]
     for path in there:
         if path.is_symlink() or not path.is_file():
-            kind = "a link" if path.is_symlink() else "a folder" if path.is_dir() else "a device"
-            raise ModelError(f"'{path}' is {kind}, which is never replaced; choose another name")
+            text = "is a link, a folder or a device, which is never replaced; choose another name"
+            raise ModelError(f"'{path}' {text}")
     if there and not force:
         names = ", ".join(f"'{path}'" for path in there)
-        are = "exists, and is" if len(there) == 1 else "exist, and are"
-        raise ModelError(f"{names} {are} not overwritten; choose another name, or --force")
+        raise ModelError(f"not overwritten: {names}; choose another name, or --force")
