@@ -61,7 +61,6 @@ from .plant_frames import frame_name as frame_name
 from .plant_frames import frame_named as frame_named
 from .plant_frames import joint_names as joint_names
 from .plant_frames import unique_names as unique_names
-from .rolling import Blade as Blade
 from .rolling import RollingWheel as RollingWheel
 from .shapes import Cylinder as Cylinder
 from .shapes import Ellipsoid as Ellipsoid

@@ -1,9 +1,7 @@
-"""Blades and wheels: nonholonomic constraints."""
+"""Wheels: nonholonomic constraints."""
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -17,64 +15,9 @@ from drake_dae.robots.surface import Vector, unit_vector
 from drake_dae.trace.expressions import length_of
 
 
-class _RestingPoint(Constraint):
-    """A point of a frame, at a contact, that has no velocity along some directions."""
-
-    frame: str
-
-    @abstractmethod
-    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """The point in m, its velocity in m/s, (3, 1) each, and the directions, shape (3, m)."""
-
-    def rate(self, kinematics: Kinematics) -> ca.SX:
-        _, velocity, directions = self._contact(kinematics)
-        return ca.mtimes(directions.T, velocity)
-
-    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        point, _, directions = self._contact(kinematics)
-        return (Application(point, directions, ca.SX(3, directions.shape[1]), self.frame),)
-
-
 @checked(ModelError)
 @dataclass(frozen=True)
-class Blade(_RestingPoint):
-    """A blade or a free wheel: a point of a frame has no velocity along an axis of it:
-
-        0 = s(q) . p_W'(q, v),
-
-    with the axis s in the world. It is nonholonomic (r = 1): all positions can be reached. The
-    constraint force is the side force in N that the ground exerts on the frame at the point,
-    positive along the axis; the ground gets the opposite.
-
-    It does not restrict the height; use a joint or a `PointOnSurface` for that. Two blades on one
-    axle are redundant.
-
-    Attributes:
-        frame: Name of the frame.
-        axis: The axis in the frame along which the point does not move, of any length, shape (3,).
-        point: The point in the frame, m, shape (3,).
-        name: The name of the constraint, the prefix of its force and its speed.
-    """
-
-    frame: str
-    axis: Vector = (0.0, 1.0, 0.0)
-    point: Vector = (0.0, 0.0, 0.0)
-    name: str = "blade"
-    force_units: ClassVar = {"side_force": "N"}
-    residual_units: ClassVar = {"side_speed": "m/s"}
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
-
-    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX, ca.SX]:
-        point = kinematics.position(self.frame, self.point)
-        side = ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axis))
-        return point, kinematics.velocity(self.frame, self.point), side
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class RollingWheel(_RestingPoint):
+class RollingWheel(Constraint):
     """A wheel rolls on level ground: its contact point has no velocity along the ground:
 
         0 = f . v_c,  0 = s . v_c,    v_c = p_W' - radius (w x u),
@@ -127,13 +70,22 @@ class RollingWheel(_RestingPoint):
         kinds = ("slip", "side_speed") if self.holds_side else ("slip",)
         return signals([f"{self.name}.{kind}" for kind in kinds], "m/s")
 
-    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX, ca.SX]:
+    def rate(self, kinematics: Kinematics) -> ca.SX:
+        lever, directions = self._contact(kinematics)
+        spin = kinematics.angular_velocity(self.frame)
+        velocity = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
+        return ca.mtimes(directions.T, velocity)
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        lever, directions = self._contact(kinematics)
+        point = kinematics.position(self.frame, self.center) - lever
+        return (Application(point, directions, ca.SX(3, directions.shape[1]), self.frame),)
+
+    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX]:
+        """radius u, shape (3, 1), and the directions f and s, shape (3, m)."""
         n = ca.SX(self.normal)
         axle = ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axle))
         along = ca.cross(axle, n)
         f = along / length_of(along)
         lever = self.parameters[0].symbol * ca.cross(f, axle)
-        spin = kinematics.angular_velocity(self.frame)
-        velocity = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
-        point = kinematics.position(self.frame, self.center) - lever
-        return point, velocity, ca.horzcat(f, ca.cross(n, f)) if self.holds_side else f
+        return lever, ca.horzcat(f, ca.cross(n, f)) if self.holds_side else f

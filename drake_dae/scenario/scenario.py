@@ -234,7 +234,7 @@ _REFERENCES: dict[str, type] = {
 _SURFACES = "Plane Sphere Cylinder Ellipsoid Torus ImplicitSurface MeasuredSurface"
 _CONSTRAINTS = (
     "PointOnSurface WeldedFrames CoincidentPoints FixedDistance JointCoupler RevoluteLoopJoint "
-    "PrismaticLoopJoint AxisNormalToSurface Blade RollingWheel"
+    "PrismaticLoopJoint AxisNormalToSurface RollingWheel"
 )
 _OUTPUTS = "PointCoordinates AxisCoordinates SurfaceCoordinates TiltFromNormal JointPositions"
 _PLANTS = "IdealConstraints MultibodyPlant CompliantContact OwnPlant"

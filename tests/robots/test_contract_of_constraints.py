@@ -37,7 +37,6 @@ from drake_dae import (
 )
 from drake_dae.errors import ModelError
 from drake_dae.robots import (
-    Blade,
     Constraint,
     ConstraintSet,
     LoopState,
@@ -141,10 +140,6 @@ def rod_at(place, base):
     return FixedDistance("base", other, "tip", POINT, float(length))
 
 
-def blade_at(place, _):
-    return Blade("tip", (1.0, 2.0, 0.0), POINT)
-
-
 def wheel_at(place, _):
     return RollingWheel("tip", 0.2, (0.1, 1.0, 0.2), POINT, (0.1, -0.2, 0.9))
 
@@ -180,7 +175,6 @@ MEMBERS = {
     "rod": (rod_at, {"tip", "base"}),
     "frictional": (frictional_at, {"tip", "world"}),
     "rough": (rough_at, {"tip", "world"}),
-    "blade": (blade_at, {"tip", "world"}),
     "wheel": (wheel_at, {"tip", "world"}),
     "tilted": (tilted_at, {"tip", "world"}),
     "coupler": (coupler_at, {"rider", "link", "base"}),
