@@ -58,14 +58,12 @@ uncollected = _Uncollected()
 
 
 def checked(error: Callable[[str], Exception], lasts: bool = False) -> Callable[[F], F]:
-    """Decorates a public name so that arguments which do not match their annotations raise.
+    """Decorates a public name so that arguments which do not match their annotations raise `error`.
 
     Of a class, the constructor and the class methods are decorated; what it makes keeps copies of
-    the caller's arrays. A number must be finite and not a bool, text is no list of letters, and the
-    entries of lists and dictionaries are checked as well. Shapes and ranges are left to the
-    function. A default is always accepted. A check takes some 10 us: nothing that is called in a
-    loop has one. `error` makes the exception of "<name>: <argument> must be <condition>, got ...".
-    Meanwhile garbage is `uncollected`, unless the function `lasts`.
+    the caller's arrays. Numbers must be finite; entries of lists and dictionaries are checked as
+    well; defaults are always accepted. A check takes some 10 us: nothing that is called in a loop
+    has one. Meanwhile garbage is `uncollected`, unless the function `lasts`.
     """
 
     def decorate(target: F) -> F:

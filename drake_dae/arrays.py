@@ -46,10 +46,8 @@ def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> Float
 
 
 def number_in(text: str) -> float | None:
-    """Returns the finite number that a text contains, as in JSON or with a sign; else None.
-
-    Python's float also accepts "1_0", "nan" and digits of other alphabets.
-    """
+    """Returns the finite number that a text contains, as in JSON or with a sign; else None."""
+    # Python's float also accepts "1_0", "nan" and digits of other alphabets.
     if not _NUMBER.fullmatch(text.strip(" \t")):
         return None
     value = float(text)
