@@ -12,18 +12,9 @@ from numpy.typing import ArrayLike
 from drake_dae.analysis.report import Analysis, Assumption, Finding
 from drake_dae.analysis.tables import count_of
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, check_whole_number, numbers
-from drake_dae.dae import (
-    DaeSystem,
-    Manifold,
-    RankMargin,
-    Stability,
-    Violation,
-    ZeroDynamics,
-    why_no_law,
-)
+from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.dae import DaeSystem, RankMargin, Stability, Violation, ZeroDynamics, why_no_law
 from drake_dae.dae.margins import ContactMargins, find_margin
-from drake_dae.dae.samples import Samples
 from drake_dae.dae.structure import (
     check_system,
     constraint_violation,
@@ -31,7 +22,7 @@ from drake_dae.dae.structure import (
     examine_constraints,
     examine_outputs,
 )
-from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
+from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.references import Reference
 
 STATEMENTS = (
@@ -46,15 +37,11 @@ STATEMENTS = (
 COUNT, SEED = 50, 0
 """The number of random states that are examined by default, and the seed of their numbers."""
 
-NEIGHBOURS = 5
-"""How many states are added close to the first given one, which may be a zero of a function."""
-
 
 @checked(ModelError)
 def analyze(
     system: DaeSystem,
     *,
-    states: ArrayLike | None = None,
     reference: Callable[[float], FloatArray] | None = None,
     times: ArrayLike | None = None,
     start: ArrayLike | None = None,
@@ -65,9 +52,9 @@ def analyze(
 ) -> Analysis:
     """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, also along a reference.
 
-    Numbers are decided at consistent states with the default parameters: at those given, or at
-    random ones around `system.nominal_state`. Degrees must be the same for all
-    numbers that parameters may have, see `DaeSystem.with_bounds`. A determinant that changes its
+    Numbers are decided at random consistent states around `system.nominal_state`, with the default
+    parameters. Degrees must be the same for all numbers that parameters may have, see
+    `DaeSystem.with_bounds`. A determinant that changes its
     sign between the first state and another one is zero on the way. From the worst of the random
     ones the smallest singular values of A(x) and B(x) are also followed downhill, inside
     the box that the random states span, so that a singular state between them is found as a
@@ -79,8 +66,6 @@ def analyze(
 
     Args:
         system: The system (1)-(3).
-        states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
-            few others close to the first, since an expression may vanish at a single state.
         reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
             the motion that it commands, and the zero dynamics judged at its first outputs.
         times: Times in s at which the reference is examined, increasing, shape (k,).
@@ -97,8 +82,7 @@ def analyze(
         The report. An assumption that is violated is part of it, with what is known before.
 
     Raises:
-        InconsistentStateError: There is no consistent state around the nominal state, or given
-            states are not consistent.
+        InconsistentStateError: There is no consistent state around the nominal state.
         ModelError: Arguments make no sense, or the system has a function that is not finite, or a
             mass matrix that is not symmetric and positive definite.
     """
@@ -109,49 +93,28 @@ def analyze(
             raise ModelError(f"{system.name}: {name} is that of a reference, and none is given")
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
-    analysis = examine(system, states, count, seed)
+    analysis = examine(system, count, seed)
     return along(analysis, reference, times, start, period, exogenous)
 
 
-def examine(
-    system: DaeSystem, states: ArrayLike | None = None, count: int = COUNT, seed: int = SEED
-) -> Analysis:
+def examine(system: DaeSystem, count: int = COUNT, seed: int = SEED) -> Analysis:
     """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics."""
     # The states.
-    random, size = np.random.default_rng(seed), system.num_states
-    if states is None:
-        nominal, given = system.nominal_state, np.zeros((0, size))
-        drawn = system.spread_around(nominal) * random.standard_normal((count, size))
-        guesses = np.vstack([nominal, nominal + drawn])
-    else:
-        given = numbers(f"{system.name}: states", states)
-        if not given.size or given.shape[1:] != (size,) or not np.all(np.isfinite(given)):
-            raise ModelError(
-                f"{system.name}: states must be finite numbers of shape (k, {size}), got {states!r}"
-            )
-        around = system.spread_around(given[0]) * random.standard_normal((NEIGHBOURS, size))
-        guesses = np.vstack([given, given[0] + 0.1 * around])
+    nominal, random = system.nominal_state, np.random.default_rng(seed)
+    drawn = system.spread_around(nominal) * random.standard_normal((count, nominal.size))
+    guesses = np.vstack([nominal, nominal + drawn])
     try:
         check_system(system)
-        constrained, nearby = examine_constraints(system, guesses)
+        constrained, samples = examine_constraints(system, guesses)
     except AssumptionError as error:
-        tried = given if len(given) else guesses
-        place = "as given" if len(given) else "around the nominal one"
-        where = f"{count_of(len(tried), 'state')} {place}"
-        return Analysis(system, where, tried, _assumptions((), [error.violation]))
-    samples = nearby
-    if len(given):
-        # Degrees are decided also at states around them, margins only at them.
-        samples = Samples(nearby.manifold, given)
-        _check_consistent(samples.manifold, given, samples.states)
-        where = f"{count_of(len(given), 'consistent state')} as given"
-    else:
-        where = f"{count_of(len(samples.states), 'consistent state')} around the nominal one"
-        if left_out := len(guesses) - len(samples.states):
-            where += f"; {left_out} more were outside the domain or off N*"
+        where = f"{count_of(len(guesses), 'state')} around the nominal one"
+        return Analysis(system, where, guesses, _assumptions((), [error.violation]))
+    where = f"{count_of(len(samples.states), 'consistent state')} around the nominal one"
+    if left_out := len(guesses) - len(samples.states):
+        where += f"; {left_out} more were outside the domain or off N*"
 
     # The constraints.
-    elimination, search = constrained.elimination, not len(given)
+    elimination = constrained.elimination
     results: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
     margins: dict[int, RankMargin] = {}
     violations: list[Violation] = []
@@ -165,7 +128,7 @@ def examine(
 
     if constrained.constraint_margin is not None:
         matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
-        margin = find_margin(samples, matrix, search=search)
+        margin = find_margin(samples, matrix, search=True)
         constrained = replace(constrained, constraint_margin=margin)
         judge(margin, constraint_violation(constrained), 2)
         regular = margin.is_regular_at_samples
@@ -173,19 +136,19 @@ def examine(
         results["constraint_structure"] = constrained
         if system.frictional_contacts:
             margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
-            results["contact_margin"] = margins_of_contacts.over(samples, search)
+            results["contact_margin"] = margins_of_contacts.over(samples, search=True)
 
     # The outputs.
     without_law = why_no_law(system)
     if regular and not without_law:
         try:
-            structure = examine_outputs(constrained, nearby)
+            structure = examine_outputs(constrained, samples)
         except AssumptionError as error:
             violations.append(error.violation)
         else:
             matrix = structure.control_matrix
             satisfied |= {4, 5}
-            margin = find_margin(samples, matrix, structure.round_off, search)
+            margin = find_margin(samples, matrix, structure.round_off, search=True)
             structure = replace(structure, control_margin=margin)
             judge(margin, control_violation(structure), 5)
             results["output_degrees"] = structure.output_degrees
@@ -264,24 +227,3 @@ def _assumptions(
         violation = violated.get(number)
         result.append(Assumption(number, statement, finding, margin, reason, violation))
     return tuple(result)
-
-
-def _check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:
-    """Checks that the user's states are consistent and inside the domain of the system."""
-    name = manifold.system.name
-    for number, state in enumerate(states):
-        if not manifold.is_consistent(state):
-            residual = manifold.residual(state)
-            worst = int(np.argmax(np.abs(residual)))
-            raise InconsistentStateError(
-                f"{name}: states[{number}] is not consistent: "
-                f"{manifold.residual_signals[worst].name} = {residual[worst]:.3g}; project it, for "
-                "example with `find_structure(system).manifold.project`",
-                residual,
-            )
-        near = 1e-4 * np.maximum(np.abs(state), np.abs(projected).max(axis=0))
-        if not np.any(np.all(np.abs(projected - state) <= near, axis=1)):
-            raise ModelError(
-                f"{name}: states[{number}] is outside the domain: functions of (1)-(3) are not "
-                "finite there"
-            )
