@@ -8,14 +8,10 @@ from referee.description import Closure, Mechanism
 NAME = "MuJoCo"
 NOTE = (
     "soft constraints: regularized acceleration, impedance at its largest value of 0.9999, "
-    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in 10,000 steps, with a "
-    "time constant of two steps, the least"
+    "Newton's solver to 1e-15, elliptic cones"
 )
 HARD = 'solimp="0.9999 0.9999 0.001 0.5 2" solref="-1e-9 -1e-9"'
 """At a consistent state the reference acceleration is zero, so no stiffness is needed."""
-
-STEPS = 10_000
-"""The steps of a motion."""
 
 # Of the top at q = 0, where its first and last axes are one: MuJoCo writes it into a file.
 mujoco.set_mju_user_warning(lambda message: None)
@@ -93,27 +89,15 @@ def xml(mechanism: Mechanism, geoms: dict[str, list[str]]) -> str:
 
 
 def solved(
-    mechanism: Mechanism,
-    q: np.ndarray,
-    v: np.ndarray,
-    geoms: dict[str, list[str]],
-    duration: float = 0.0,
+    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, geoms: dict[str, list[str]]
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The model, and its data after the forward dynamics at a state, or a while later."""
-    text = xml(mechanism, geoms)
-    step = duration / STEPS
-    if duration:
-        text = text.replace('solref="-1e-9 -1e-9"', f'solref="{2 * step} 1"')
-    model = mujoco.MjModel.from_xml_string(text)
-    if duration:
-        model.opt.timestep, model.opt.integrator = step, mujoco.mjtIntegrator.mjINT_RK4
+    """The model, and its data after the forward dynamics at a state."""
+    model = mujoco.MjModel.from_xml_string(xml(mechanism, geoms))
     data = mujoco.MjData(model)
     for i in range(mechanism.size):
         joint = model.joint(f"j{i}")
         data.qpos[joint.qposadr[0]], data.qvel[joint.dofadr[0]] = q[i], v[i]
         data.qfrc_applied[joint.dofadr[0]] = mechanism.torques.get(i, 0.0)
-    for _ in range(STEPS if duration else 0):
-        mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     return model, data
 
@@ -155,22 +139,13 @@ def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarra
     return full[np.ix_(order, order)]
 
 
-def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The forces after the motion from there."""
-    if any(closure.kind == "plane" for closure in mechanism.closures):
-        raise NotImplementedError("a ball stands for the point that touches: other motion")
-    return forces(mechanism, q, v, mechanism.duration)
-
-
-def forces(
-    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float = 0.0
-) -> dict[str, np.ndarray]:
-    """The force of each closure in the components of `force_names`, after a while."""
+def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`."""
     if any(any(closure.road) for closure in mechanism.closures):
         raise NotImplementedError("no constraint that moves with time")
     if any(closure.kind == "hinge" for closure in mechanism.closures):
         raise NotImplementedError("no hinge among the equality constraints")
-    model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v), duration)
+    model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v))
     found = {}
     for closure in mechanism.closures:
         if closure.kind == "plane":

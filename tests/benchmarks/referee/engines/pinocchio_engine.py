@@ -44,16 +44,6 @@ def order(mechanism: Mechanism, model: pin.Model) -> list[int]:
     return [model.idx_vs[model.getJointId(f"j{i}")] for i in range(mechanism.size)]
 
 
-def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """M in the order of the description."""
-    model, _ = model_of(mechanism)
-    places = order(mechanism, model)
-    own = np.zeros(model.nq)
-    own[places] = q
-    matrix = pin.crba(model, model.createData(), own)
-    return (np.triu(matrix) + np.triu(matrix, 1).T)[np.ix_(places, places)]
-
-
 def solver(mechanism: Mechanism, q: np.ndarray, v: np.ndarray, proximal: tuple = PROXIMAL) -> tuple:
     """`constraintDynamics` at a state, without arguments, and the constraints that it finds."""
     for closure in mechanism.closures:
