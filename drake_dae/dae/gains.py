@@ -68,12 +68,11 @@ class FeedbackGains:
     @checked(GainError)
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
         """Returns the exact tracking error exp(E t) e(0) of (30), (31), shape (k, p)."""
-        moments, matrix = vector("times", np.atleast_1d(times), None, GainError), self.error_matrix
-        coordinates = numbers("initial", initial, GainError)
-        if coordinates.shape != (len(matrix),):
-            raise GainError(
-                f"the error has {len(matrix)} coordinates, got shape {coordinates.shape}"
-            )
+        moments = vector("times", np.atleast_1d(times), None, GainError)
+        coordinates = vector("initial", initial, self.layout.chain_size, GainError)
+        result = np.zeros((moments.size, len(self.degrees)))
+        if not coordinates.size:
+            return result
         # From one time to the next: a log with fixed steps has few different step lengths once its
         # times are rounded to a power of 2, whose differences floating-point numbers compute
         # exactly.
@@ -81,24 +80,16 @@ class FeedbackGains:
         order = np.argsort(moments)
         steps = np.diff(np.round(moments[order] / grid) * grid, prepend=0.0)
         lengths, which = np.unique(steps, return_inverse=True)
-        result = np.zeros((moments.size, len(self.degrees)))  # (31), (34)
-        orders, owner = self.layout.orders, self.layout.owners
-        for outputs in _coupled(self.layout, self.matrix):
-            rows = np.flatnonzero(np.isin(owner, outputs))
-            block = matrix[np.ix_(rows, rows)]
-            # In units of its own rate, a power of 2, so that the entries of exp(E t) have similar
-            # sizes.
-            rate = np.exp2(np.round(np.log2(np.max(np.abs(np.linalg.eigvals(block))))))
-            scale = rate ** orders[rows]
-            transitions = scipy.linalg.expm(
-                lengths[:, None, None] * (block / scale[:, None] * scale)
-            )
-            current = coordinates[rows] / scale
-            response = np.zeros((moments.size, rows.size))
-            for row, index in zip(order, which, strict=True):
-                current = transitions[index] @ current
-                response[row] = current
-            result[:, owner[rows[orders[rows] == 0]]] = response[:, orders[rows] == 0]
+        # In units, powers of 2, in which the entries of E, and so of exp(E t), have similar sizes.
+        balanced, (units, _) = scipy.linalg.matrix_balance(
+            self.error_matrix, permute=False, separate=True
+        )
+        transitions = scipy.linalg.expm(lengths[:, None, None] * balanced)  # (31), (34)
+        rows, current = np.zeros((moments.size, len(units))), coordinates / units
+        for row, index in zip(order, which, strict=True):
+            current = transitions[index] @ current
+            rows[row] = current
+        result[:, self.layout.dynamic] = (rows * units)[:, self.layout.heads]
         return result
 
 
@@ -228,13 +219,3 @@ def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
     if np.abs(np.imag(monic)).max() > 1e-12 * np.abs(monic).max():
         raise GainError(f"complex poles of output '{name}' must come in conjugate pairs: {roots}")
     return [float(number) for number in np.real(monic)[:0:-1]]
-
-
-def _coupled(layout: DerivativeLayout, matrix: FloatArray) -> list[list[int]]:
-    """Groups of outputs whose errors are coupled."""
-    groups: list[set[int]] = []
-    for i in map(int, layout.dynamic):
-        joined = {i, *map(int, layout.owners[np.flatnonzero(matrix[i])])}
-        apart = [group for group in groups if not group & joined]
-        groups = [*apart, joined.union(*(group for group in groups if group & joined))]
-    return [sorted(group) for group in groups]

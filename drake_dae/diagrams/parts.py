@@ -117,7 +117,7 @@ def check_force_loop(
             "it closes an algebraic loop; pass a sensor=ForceSensor(...) with a time_constant or a "
             "sample_period, or a sampling"
         )
-    gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
+    gain = measured.gain if measured else 0.0
     lag, samples = (sensor.time_constant, sensor.sample_period) if sensor is not None else (0, 0)
     loops = [(samples, 0)] if samples else []
     if sampling is not None and at_once:
@@ -130,7 +130,7 @@ def check_force_loop(
         polynomial[-1] += (1.0 - a) * gain
         if (radius := np.max(np.abs(np.roots(polynomial)), initial=0.0)) >= 1.0:
             raise WiringError(
-                f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample of "
+                f"the sampled force loop diverges: with Gbar = {gain:.3g} each sample of "
                 f"{period:g} s multiplies the force error by {radius:.3g}. Lower force_gain, or "
                 "give the sensor a time_constant well above the period of samples and the delay"
             )

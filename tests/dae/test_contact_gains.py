@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from drake_dae import contact_gains
+from drake_dae.errors import AdviceWarning
 
 
 def test_one_sample_at_a_kilohertz_gives_the_rate_of_the_docstring():
@@ -84,10 +85,9 @@ def test_gains_are_advised_in_silence_only_where_neighbours_come_to_rest(swing, 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         found = contact_gains(frequency**2 / mobility, mobility, T, delay, 0.0)
-    if told:
-        assert swing > {0: 1.3, 1: 0.6, 2: 0.36}[delay]
-        return
-    for factor in (0.3, 1.0, 1.1, 2.0):
+
+    def share_left(factor):
+        """Of the motion, after 3,000 samples of a contact of another stiffness."""
         own = frequency * factor**0.5
         step = expm(T * np.array([[0.0, 1.0, 0.0], [-(own**2), 0.0, 1.0], [0.0, 0.0, 0.0]]))[:2]
         (place, speed), total, held = (1.0, 0.0), 0.0, [0.0] * delay
@@ -97,4 +97,14 @@ def test_gains_are_advised_in_silence_only_where_neighbours_come_to_rest(swing, 
             total += found.force_gain * own**2 * T * place
             place, speed = step @ [place, speed, held.pop(0)]
             sizes.append(abs(place))
-        assert max(sizes[-300:]) < 0.5 * max(sizes[:300]), factor
+        return max(sizes[-300:]) / max(sizes[:300])
+
+    if not told:
+        assert max(map(share_left, (0.3, 1.0, 1.1, 2.0))) < 0.5
+        return
+    assert [one.category for one in told] == [AdviceWarning]
+    assert swing > {0: 1.3, 1: 0.6, 2: 0.36}[delay]
+    # The stiffness that is named does not come to rest indeed, unless samples do not show it.
+    factor = float(str(told[0].message).split("which is ")[1].split(" times")[0])
+    if swing * factor**0.5 < 3.1:
+        assert not share_left(1.02 * factor) < 0.05

@@ -71,8 +71,7 @@ def test_every_form_reads_back_equal(tmp_path):
         ],
         sensors=forms.Sensors(force=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0])),
         law=forms.Law(
-            forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]),
-            force_gain=np.eye(2),
+            forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]), force_gain=2.0
         ),
         references={
             "a": dd.ConstantReference([1.0]),
