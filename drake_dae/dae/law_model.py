@@ -89,9 +89,8 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
         M v' + D (v + T v') = u,    or    (M + T D) v' + D v = u.
 
     With M alone the errors of a light joint with T D / M = 30, as in the wrists of some arms, decay
-    30 times as slowly as designed. Drake's discrete MultibodyPlant, whose damping is implicit, adds
-    h / 2 to T. D is -df / dv without Coulomb friction at the nominal speeds, at any position. v are
-    the states that a force or a control drives, if their own damping there is positive.
+    30 times as slowly as designed. D is -df / dv without Coulomb friction at the nominal speeds, at
+    any position; v are the states that a force or a control drives, with a positive damping there.
     """
     if latency < 0.0:
         raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")
@@ -200,10 +199,7 @@ class IntegralAction:
         names: Sequence[str],
         measured: ForceMeasurement | None,
     ) -> None:
-        try:
-            chosen = places_of("output", names, system.output_signals, "integral: ")
-        except ModelError as error:
-            raise GainError(str(error)) from None
+        chosen = places_of("output", names, system.output_signals, "integral: ")
         for i, name in zip(chosen, names, strict=True):
             if chosen.count(i) > 1:
                 raise GainError(f"integral: '{name}' occurs twice")

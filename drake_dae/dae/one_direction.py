@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.disturbance import ChainFilter, transition
+from drake_dae.dae.disturbance import filter_gain, transition
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
     error, rate, disturbance = position, velocity, now["r" if "r" in now else "a"]
     if rates.state_rate:
         ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
-        gain = _filter(rates.state_rate, rates.observer_rate, T, ratio).gain
+        gain = _filter(rates.state_rate, rates.observer_rate, T, ratio)
         ahead = np.array([now["q"], now["w"], now["a"]])
         new = np.array([position, velocity])[: gain.shape[1]] - ahead[: gain.shape[1]]
         error, rate, disturbance = estimated = ahead + gain @ new
@@ -190,5 +190,5 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
     return SampledLoop(both[:, :size], both[:, size:count], shown, both[:, count], T)
 
 
-_filter = lru_cache(maxsize=256)(ChainFilter.of)
+_filter = lru_cache(maxsize=256)(filter_gain)
 """The same filter serves all masses and stiffnesses."""

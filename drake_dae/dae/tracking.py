@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, listed, vector
+from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
 from drake_dae.dae.law_model import Deflection, ForceMeasurement, IntegralAction, law_structure
 from drake_dae.dae.signals import DerivativeLayout, Signal
@@ -124,11 +124,9 @@ class TrackingLaw:
             outputs["integral_rate"] = self.integral.rate(chain, values)
         # The initial value of (30).
         start = self.integral.coordinates(own - reference[layout.chained.tolist(), :])
+        names = {"reference": reference, "integral": self.integral.symbol}
         self.coordinates_function = self.system.trace(
-            "error coordinates",
-            {"coordinates": start},
-            {"reference": reference, "integral": self.integral.symbol},
-            often=False,
+            "error coordinates", {"coordinates": start}, names, often=False
         )
         parameters = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         self._ubar, self.outputs, self.pivot = ubar, outputs, pivot
@@ -229,12 +227,8 @@ class TrackingLaw:
         """
         measured = [] if measured_force is None else [measured_force]
         if self.integral.outputs:
-            measured.append(self._integrals(integral))
+            measured.append(np.zeros(len(self.integral.outputs)) if integral is None else integral)
         return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
-
-    def _integrals(self, integral: ArrayLike | None) -> FloatArray:
-        size = len(self.integral.outputs)
-        return vector("integral", np.zeros(size) if integral is None else integral, size, GainError)
 
     def error_coordinates(
         self,
@@ -247,7 +241,8 @@ class TrackingLaw:
 
         The integral of an error stands before it; the arguments are those of `control`.
         """
-        values, sigma = self.system.parameter_vector(parameters), self._integrals(integral)
+        values = self.system.parameter_vector(parameters)
+        sigma = np.zeros(len(self.integral.outputs)) if integral is None else integral
         return self.coordinates_function(state, reference, sigma, values)[0]
 
     def predicted_error(

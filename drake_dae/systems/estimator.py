@@ -31,7 +31,7 @@ class StateEstimator(ParameterizedSystem):
 
         q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,    e = qm - q,
 
-    with the gains of the stationary Kalman filter of each position, `ChainFilter`.
+    with the gains of the stationary Kalman filter of each position, `filter_gain`.
 
     **Friction** takes its share of r, mu' = k_f (c . r) / (c . c) with c = S^T dg/dmu v. Parameters
     that `with_disturbance` made exogenous, and friction beside them, follow by `ParameterFilter`.

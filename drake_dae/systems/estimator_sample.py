@@ -10,8 +10,8 @@ from drake_dae.blocks.block import TIME, Held, stacked, where_finite
 from drake_dae.dae import Lags, Observation, TrackingLaw
 from drake_dae.dae.disturbance import (
     DISTURBANCE,
-    ChainFilter,
     estimated_within,
+    filter_gain,
     orthogonal_part,
     shares,
 )
@@ -471,6 +471,6 @@ def _gains(
     for which, rate in enumerate(rates):
         for i, (q, v) in enumerate(zip(*deviations, strict=True)):
             ratio = v / q if v > 0.0 and q > 0.0 else None
-            own = ChainFilter.of(state_rate, rate, period, ratio).gain
+            own = filter_gain(state_rate, rate, period, ratio)
             found[which, :, i, : own.shape[1]] = own
     return [[ca.DM(each) for each in gains] for gains in found]

@@ -9,7 +9,7 @@ from runs import some
 from scipy.integrate import solve_ivp
 
 from drake_dae.dae import SensorNoise
-from drake_dae.dae.disturbance import ChainFilter, transition
+from drake_dae.dae.disturbance import filter_gain, transition
 from drake_dae.dae.one_direction import Direction, DirectionGains, sampled_loop
 
 T = 1e-3
@@ -27,7 +27,7 @@ def stepped(direction, rates, noise, steps, seed=0, push=0.0):
     r, last, acted, predicted = 0.0, 0.0, 0.0, np.zeros(3)
     w, filtered = (direction.mass_error * stiff) ** 0.5, None
     if rates.state_rate:
-        filtered = ChainFilter.of(rates.state_rate, rates.observer_rate, T)
+        filtered = filter_gain(rates.state_rate, rates.observer_rate, T)
     errors, wanted = np.zeros(steps), np.zeros(steps)
     draws = random.normal(size=(steps, 3))
     for k in range(steps):
@@ -36,7 +36,7 @@ def stepped(direction, rates, noise, steps, seed=0, push=0.0):
         if filtered is None:
             error, rate, d = position, velocity, r
         else:
-            error, rate, d = known = predicted + filtered.gain[:, 0] * (position - predicted[0])
+            error, rate, d = known = predicted + filtered[:, 0] * (position - predicted[0])
         if stiff:
             a = -rates.gains[2] * rate - rates.force_gain * sigma - d
             sigma -= T * direction.mobility * force
@@ -95,7 +95,7 @@ def test_deviations_are_those_of_a_loop_with_noise(direction, rates):
 
 @pytest.mark.parametrize(("gains", "state_rate"), [(FREE.gains, 100.0), ((8e3, 1.2e3, 60.0), 60.0)])
 def test_noise_of_fast_samples_leaves_the_variance_of_the_docstring(gains, state_rate):
-    """By quadrature, with the poles of `ChainFilter`; the mean delay of 0.05 ms is neglected."""
+    """By quadrature, with the poles of `filter_gain`; the mean delay of 0.05 ms is neglected."""
     period, slow = 1e-4, 20.0
     roots = np.roots([1.0, 0.0, 0.0, 0.0, state_rate**4, 0.0, -((state_rate**2 * slow) ** 2)])
     D = np.real(np.poly(roots[roots.real < 0.0]))
