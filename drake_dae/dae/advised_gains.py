@@ -11,13 +11,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.contact_gains import ContactGains, contact_damping, pole_gains
-from drake_dae.dae.one_direction import (
-    Direction,
-    DirectionGains,
-    SampledLoop,
-    SensorNoise,
-    sampled_loop,
-)
+from drake_dae.dae.one_direction import DirectionGains, SampledLoop, SensorNoise, sampled_loop
 from drake_dae.errors import GainError, ModelError
 
 _PHASE = 0.3
@@ -89,14 +83,13 @@ class SensedContact:
         self, rates: DirectionGains, contact: bool, mass_error: float = 1.0, share: float = 1.0
     ) -> SampledLoop:
         """That of a joint's free motion, or of the contact with a fraction of its stiffness."""
-        direction = Direction(self.period, self.delay, mass_error=mass_error)
+        noise, timing = self.noise, (self.period, self.delay)
         if not contact:
-            return sampled_loop(direction, rates, self.noise)
-        pressed = replace(direction, mobility=self.mobility, stiffness=share * self.stiffness)
-        position, velocity = self.noise.position, self.noise.velocity
-        lever = self.contact_lever
-        noise = replace(self.noise, position=lever * position, velocity=lever * velocity)
-        return sampled_loop(pressed, rates, noise)
+            return sampled_loop(rates, noise, *timing, mass_error=mass_error)
+        moves = [self.contact_lever * each for each in (noise.position, noise.velocity)]
+        noise = replace(noise, position=moves[0], velocity=moves[1])
+        stiffness = share * self.stiffness
+        return sampled_loop(rates, noise, *timing, self.mobility, stiffness, mass_error)
 
     @cached_property
     def best_damping(self) -> float:

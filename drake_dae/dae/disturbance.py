@@ -42,8 +42,6 @@ def with_disturbance(
             f"{system.name}: with_disturbance needs names of states, each once, got "
             f"{', '.join(states) or 'none'}"
         )
-    if DISTURBANCE in [p.name for p in system.parameters]:
-        raise ModelError(f"{system.name} has a parameter '{DISTURBANCE}' already")
     parameter = Parameter(DISTURBANCE, np.zeros(len(rows)), exogenous=True)
     force = ca.SX(system.num_states, 1)
     force[rows] = parameter.symbol
@@ -82,9 +80,8 @@ def estimated_within(
 class IdentifiedTerms:
     """The parameters theta of a system that an observer estimates, c numbers.
 
-    An error delta = theta* - theta leaves the disturbance d = -G delta in the balance of the
-    momentum p, where G is the derivative of p' - S^T (E' x + f + g v + h u) with respect to theta.
-    An error of a surface leaves a distance phi(x) that is not zero in contact.
+    An error delta = theta* - theta leaves the disturbance d = -G delta, where G is the derivative
+    of p' - S^T (E' x + f + g v + h u) by theta; that of a surface a distance phi(x) in contact.
     """
 
     parameters: tuple[Parameter, ...]
@@ -303,14 +300,11 @@ Metric = Callable[[ca.SX], ca.SX]
 def shares(
     forces: ca.SX, planes: Sequence[ca.SX], velocity: ca.SX, metric: Metric, d: ca.SX
 ) -> ca.SX:
-    """Returns the part of d that each friction force c explains, as a factor, shape (c, 1):
+    """Returns the part (c~^T W d) / (c~^T W c) of d that each friction force c explains, (c, 1).
 
-        (c~^T W d) / (c~^T W c),
-
-    where c~ is c without the part that a contact force orthogonal to the sliding explains as well.
-    So a payload that pulls the tool across its motion is no friction, although M^-1 couples both.
-    Forces and planes T, the reactions of each contact if it sticks, are columns; the velocity has
-    shape (k, 1).
+    c~ is c without the part that a contact force orthogonal to the sliding explains as well. So a
+    payload that pulls the tool across its motion is no friction, although M^-1 couples both.
+    Forces and planes T, the reactions of each contact if it sticks, are columns.
     """
     components = list[ca.SX]()
     for force, plane in zip(ca.horzsplit(forces), planes, strict=True):

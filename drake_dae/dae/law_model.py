@@ -26,12 +26,9 @@ def law_structure(
         y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0, or the symbol of a deflection,
 
     without a term in y_i itself, which would control the position of the surface instead of the
-    force. On N* all y_i^(j) vanish, so that nothing changes there: alpha (13) becomes alpha - A^-1
-    (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay. With a latency the mass matrix
-    changes: see `acting_late`.
-
-    Where a force is an output of degree mu >= 1, the law takes the added term as constant: along
-    the model its derivatives would destabilize a compliant contact, which moves otherwise.
+    force. On N* nothing changes: alpha (13) becomes alpha - A^-1 (sum_j c_j L_f^j k_i), and beta
+    (14), the degrees, A and B stay. For a force of degree mu >= 1 the added term is taken as
+    constant: its derivatives would destabilize a compliant contact, which moves otherwise.
     """
     system = acting_late(structure.system, latency)
     if damping is None and deflection is None and system is structure.system:
@@ -244,9 +241,9 @@ class Deflection:
 
         phi'' + c phi' = phi_d'' + c phi_d' = -(lambda_d'' + c lambda_d') / k,
 
-    so that e = phi - phi_d obeys e'' + c e' + A k e = 0 for any reference that is twice
-    differentiable, and friction is that of lambda_d. A stiffness that is wrong by a factor s leaves
-    |1 - s| of the oscillation. `symbol` stands for the right side, and is zero on N*.
+    so that e = phi - phi_d obeys e'' + c e' + A k e = 0, and friction is that of lambda_d. A
+    stiffness that is wrong by a factor s leaves |1 - s| of the oscillation. `symbol` stands for the
+    right side, and is zero on N*.
     """
 
     def __init__(

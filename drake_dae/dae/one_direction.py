@@ -29,21 +29,6 @@ class SensorNoise:
 
 
 @dataclass(frozen=True)
-class Direction:
-    """The motion in one direction, sampled each `period` seconds and delayed by some samples.
-
-    `mobility` is the acceleration per force in the model of the law, `mass_error` the true one
-    relative to it; `stiffness` in N/m is 0 in a free direction.
-    """
-
-    period: float
-    delay: int
-    mobility: float = 1.0
-    stiffness: float = 0.0
-    mass_error: float = 1.0
-
-
-@dataclass(frozen=True)
 class DirectionGains:
     """The gains of a law and its observer in a direction, in 1/s.
 
@@ -104,13 +89,22 @@ class SampledLoop:
         return float(max(rest @ spread @ rest, 0.0)) ** 0.5
 
 
-def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise) -> SampledLoop:
-    """Returns the loop of a law whose model is right, except for the `mass_error`.
+def sampled_loop(
+    rates: DirectionGains,
+    noise: SensorNoise,
+    period: float,
+    delay: int,
+    mobility: float = 1.0,
+    stiffness: float = 0.0,
+    mass_error: float = 1.0,
+) -> SampledLoop:
+    """Returns the loop of a law in one direction, sampled each `period` seconds and delayed.
 
     In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
-    commands, held for a sample after its delay, and m the mass_error. In a contact the depth moves
-    as phi'' = m (a - A k phi) + d, and the law measures the force -k phi. With the estimates
-    e, e' and d of observer or estimator the law commands
+    commands, held for a sample after its delay of some samples, and m the mass_error: what a force
+    accelerates, relative to the law's model. In a contact of the stiffness k the depth moves as
+    phi'' = m (a - A k phi) + d, and the law measures the force -k phi. With the estimates e, e' and
+    d of observer or estimator the law commands
 
         a = -K_1 sigma - K_2 e - K_3 e' - d            free,
         a = -c phi' - A K_i sigma_F - d                in a contact,
@@ -124,9 +118,9 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
 
     P = s^3 + K_3 s^2 + K_2 s + K_1, of the variance T sigma_n^2 / (2 pi) int |e/n|^2 dw.
     """
-    T, mass, A = direction.period, direction.mass_error, direction.mobility
-    stiff, (K_1, K_2, K_3) = A * direction.stiffness, rates.gains
-    held = [f"held{i}" for i in range(direction.delay)]
+    T, mass, A, stiff = period, mass_error, mobility, mobility * stiffness
+    K_1, K_2, K_3 = rates.gains
+    held = [f"held{i}" for i in range(delay)]
     parts = ["e", "v", "sum", *held]
     parts += ["q", "w", "a"] if rates.state_rate else ["r", "before", "acted"]
     parts += ["difference", "measured"] if noise.velocity_bandwidth else []
@@ -184,7 +178,7 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
     orders["sum"] = 1 if stiff else -1
     units = T ** np.array([orders.get(name, 2) for name in parts])
     both = np.array([after[name] for name in parts]) * units[:, None]
-    shown = np.array([-direction.stiffness * now["e"] if stiff else now["e"], command])[:, :count]
+    shown = np.array([-stiffness * now["e"] if stiff else now["e"], command])[:, :count]
     both[:, :size] /= units
     shown[:, :size] /= units
     return SampledLoop(both[:, :size], both[:, size:count], shown, both[:, count], T)

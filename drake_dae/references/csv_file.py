@@ -17,7 +17,6 @@ from drake_dae.references.splines import (
     MOST_POINTS,
     PiecewisePolynomials,
     PiecewiseReference,
-    rounded_up,
     uniform_spline,
 )
 
@@ -93,8 +92,7 @@ class CsvReference(PiecewiseReference):
         step = self.smoothing or max(float(np.median(np.diff(times))), finest)
         if step < finest * (1.0 - 1e-9):
             raise ReferenceSignalError(
-                f"smoothing must be {rounded_up(finest)} s or more for {times[-1]:.3g} s, got "
-                f"{step:g} s"
+                f"smoothing must be above {finest:.3g} s for {times[-1]:.3g} s, got {step:g} s"
             )
         while True:
             moments = step * np.arange(np.ceil(times[-1] / step - 1e-9) + 1.0)

@@ -151,11 +151,10 @@ class PolylineReference(PiecewiseReference):
         positive("corner", self.corner, ReferenceSignalError)
         check_order(self.order, 2, 12)
         length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
-        least = length * self.order / 2 / MOST_POINTS
-        if self.corner < least:
+        if self.corner < (least := length * self.order / 2 / MOST_POINTS):
             raise ReferenceSignalError(
-                f"corner must be {rounded_up(least)} or more for a path of length {length:.3g}, "
-                f"got {self.corner:g}"
+                f"corner must be above {least:.3g} for a path of length {length:.3g}, got "
+                f"{self.corner:g}"
             )
 
     @property
@@ -278,9 +277,3 @@ def _check_points(reference: PolylineReference | WaypointsReference) -> FloatArr
         i = int(np.argmin(lengths))
         raise ReferenceSignalError(f"points {i} and {i + 1} are the same, {rows[i]}")
     return points
-
-
-def rounded_up(value: float) -> str:
-    """Formats a positive number with three digits, rounded up."""
-    text = f"{value:.3g}"
-    return text if float(text) >= value else f"{1.01 * value:.3g}"
