@@ -43,7 +43,7 @@ def simulate(
 ) -> RunStatistics:
     """Runs a diagram from a context; afterwards the context has the final state, on the manifold.
 
-    If the states or errors of a `Plant` diverge, an exception ends the run: see `DivergenceWatch`.
+    If states or errors of a `Plant` diverge, an exception ends the run: see `DivergenceWatch`.
 
     In runs of many steps all traced blocks are composed to one, so that Drake calls Python once for
     each derivative and sample; see `compile_diagram`. A live view or a real-time rate need each
@@ -85,7 +85,7 @@ def simulate(
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start, began, steps = context.get_time(), 0.0, 0
-    watch = RunWatch(diagram, context, config, duration)
+    watch = RunWatch(diagram, context, may_diverge)
 
     def stop(number: signal.Signals) -> None:
         ending(number)
@@ -109,9 +109,9 @@ def simulate(
         try:
             simulator.Initialize()
             began = time.perf_counter()
-            may_diverge = may_diverge or not watch.begin(context)
+            watch.look(context, is_last=True)
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
-            if progress or look is not None or not may_diverge or ending.signal is not None:
+            if progress or look is not None or watch.is_needed or ending.signal is not None:
                 simulator.set_monitor(monitor)
             composed = None
             if not config.target_realtime_rate:

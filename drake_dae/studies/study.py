@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import isfinite
@@ -31,8 +31,7 @@ class Outcome(StrEnum):
 
     FINISHED = "finished"
     FAILED = "failed"  # Before its end; the figures are those up to the failure.
-    NO_START = "no start"  # There is no consistent initial state.
-    REFUSED = "refused"  # The scenario contradicts itself, or violates an assumption.
+    REFUSED = "refused"  # It contradicts itself, violates an assumption, or has no start.
     CRASHED = "crashed"  # The process ended, or raised an unexpected error.
     TIMED_OUT = "timed out"
 
@@ -44,12 +43,11 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run of a sweep ended and why, its figures, and the signals beyond their limits."""
+    """How a run of a sweep ended and why, and its figures."""
 
     outcome: Outcome
     reason: str = ""
     figures: Mapping[str, float] = field(default_factory=dict)
-    exceeded: tuple[str, ...] = ()
 
 
 def figures_of(record: Record, ranges: Sequence[SignalRange]) -> dict[str, float]:
@@ -108,16 +106,12 @@ class Study:
                 others.append(f"run {run}, {name}: {result.outcome}: {result.reason}")
         more = [f"and {len(others) - MOST_REASONS} more"] * (len(others) > MOST_REASONS)
         parts += [[*others[:MOST_REASONS], *more]] if others else []
-        if beyond := Counter(name for result in self.results for name in result.exceeded):
-            counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
-            parts.append([f"beyond their limits: {', '.join(counted)}"])
         rows = []
-        for figure in self.figures:
-            values = self.values(figure)
-            least, largest = str(np.nanargmin(values)), str(np.nanargmax(values))
-            extent = np.nanmin(values), np.nanmedian(values), np.nanmax(values)
-            low, median, high = (f"{number:.4g}" for number in extent)
-            rows.append([figure, low, least, median, high, largest])
+        for name, extent in self.extent().items():
+            low, median, high = (f"{number:.4g}" for number in extent.values())
+            values = self.values(name)
+            at_low, at_high = str(np.nanargmin(values)), str(np.nanargmax(values))
+            rows.append([name, low, at_low, median, high, at_high])
         head = ["figure", "least", "at run", "median", "largest", "at run"]
         return to_text([*parts, Table(head, rows)] if rows else parts)
 
@@ -152,18 +146,17 @@ class Study:
             **{key: [changes.get(key) for changes in self.variations] for key in self.keys},
             "outcome": [str(result.outcome) for result in self.results],
             "reason": [result.reason for result in self.results],
-            "beyond limits": [" ".join(result.exceeded) for result in self.results],
             **{name: [r.figures.get(name) for r in self.results] for name in self.figures},
         }
 
     def extent(self) -> dict[str, dict[str, float]]:
         """Name of a figure -> its least, median and largest value over the runs that have it."""
-        of: dict[str, Callable[[FloatArray], Any]]
-        of = {"least": np.nanmin, "median": np.nanmedian, "largest": np.nanmax}
-        return {
-            figure: {name: float(function(self.values(figure))) for name, function in of.items()}
-            for figure in self.figures
-        }
+        found = dict[str, dict[str, float]]()
+        for name in self.figures:
+            values = self.values(name)
+            three = np.nanmin(values), np.nanmedian(values), np.nanmax(values)
+            found[name] = dict(zip(("least", "median", "largest"), map(float, three), strict=True))
+        return found
 
     def plot(self) -> Figure:
         """Each figure that varies over the first key with numbers that vary, or over the runs.
@@ -172,9 +165,9 @@ class Study:
         """
         name, x = "run", np.arange(len(self.results), dtype=float)
         for key in reversed(self.keys):
-            column = _numbers([changes.get(key) for changes in self.variations])
-            if _varies(column):
-                name, x = key, column
+            column = [_number(changes.get(key)) for changes in self.variations]
+            if _varies(np.array(column)):
+                name, x = key, np.array(column)
         drawn = [each for each in self.figures if _varies(self.values(each))][:MOST_AXES]
         unfinished = np.array([r.outcome is not Outcome.FINISHED for r in self.results])
         rows = -(-max(len(drawn), 1) // 3)
@@ -208,11 +201,10 @@ def _cell(entry: Any) -> Any:
     return json.dumps(entry) if isinstance(entry, (dict, list)) else entry
 
 
-def _numbers(column: Sequence[Any]) -> FloatArray:
-    """A column as numbers, from numbers or lists of one number; nan for other entries."""
-    flat = [entry[0] if isinstance(entry, list) and len(entry) == 1 else entry for entry in column]
-    is_number = [isinstance(e, (int, float)) and not isinstance(e, bool) for e in flat]
-    return np.array([e if yes else np.nan for e, yes in zip(flat, is_number, strict=True)], float)
+def _number(entry: Any) -> float:
+    """A number, or that of a list of one; nan for other entries."""
+    entry = entry[0] if isinstance(entry, list) and len(entry) == 1 else entry
+    return float(entry) if isinstance(entry, (int, float)) else np.nan
 
 
 def _varies(values: FloatArray) -> bool:

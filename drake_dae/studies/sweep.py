@@ -1,24 +1,19 @@
 """Sweeps: a scenario run many times with other values of some of its keys."""
 
 import json
-import multiprocessing.context
 import os
 import re
 import sqlite3
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future
+from concurrent.futures import wait as wait_for
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from dataclasses import asdict
 from functools import lru_cache
 from importlib.metadata import version
+from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from threading import Lock, RLock
 from types import ModuleType
@@ -80,8 +75,7 @@ def sweep(
     A sweep that was interrupted continues when the same call is made again: it skips runs with a
     result in the file. A failed run is an outcome with a reason. A run whose process dies, or that
     exceeds the time limit, is lost alone, and the next call repeats it. Keys and values of up to
-    twenty variations are checked before the first run, and up to three are built until one is
-    valid.
+    twenty variations are checked before the first run, which has to be a valid one.
 
     Runs that differ only in start, duration, integrator, plant.parameters, seeds, or gains that
     couple no outputs, share one closed loop in each process.
@@ -90,8 +84,7 @@ def sweep(
         scenario: A scenario from `load_scenario`.
         variations: For each run, dotted key of the scenario -> value; for example from
             `drake_dae.studies.make_variations`.
-        file: The file, an SQLite database: a row for each run that has ended. Several processes
-            may continue one sweep in it at the same time.
+        file: The file, an SQLite database: a row for each run that has ended.
         workers: The number of processes of this machine; None for the number of its cores.
         executor: Where to run instead, such as `dask.distributed.Client(...).get_executor()`. Its
             machines need drake_dae and the files of the robot. Time limits are then those of the
@@ -110,46 +103,42 @@ def sweep(
     if workers is not None:
         check_whole_number("workers", workers, 1)
     positive("time_limit", time_limit)
+
+    # The scenario, and the loops that its runs need.
     with suppress(ScenarioError):  # Each run reports it; a run may have other values.
         scenario = complete_scenario(scenario).scenario
     base = scenario_data(scenario)
     chosen = [{key: plain(key, value) for key, value in changes.items()} for changes in variations]
-    _check(base, chosen)
+    if not chosen:
+        raise ScenarioError(("", "a sweep needs at least one variation"))
+    for changes in chosen[:: -(-len(chosen) // CHECKED)]:
+        read_scenario(varied_data(base, changes))
     simulated = for_rollout(scenario)[0] if rollout else scenario
     structures = [json.dumps(structure_of(each, simulated), sort_keys=True) for each in chosen]
-    num_structures, lasting = len(set(structures)), None
+    num_structures, lasting = len({*structures}), None
     if rollout:
         durations = (each.get("duration", scenario.duration) for each in chosen)
         lasting = sum(d for d in durations if isinstance(d, (int, float))) / num_structures
-    head = {"drake_dae": version("drake_dae"), "rollout": json.dumps(rollout)}
-    head |= {key: json.dumps(part) for key, part in base.items()}
-    head["variations"] = json.dumps(chosen)
     path, settings = Path(file), json.dumps([base, lasting])
+
+    # The runs that the file has not, those of one structure together: a process keeps its loop.
+    head = {"drake_dae": version("drake_dae"), "rollout": rollout, **base, "variations": chosen}
     with ending_signals(end_at_once):
         if not os.path.lexists(path):
-            runner, errors = Runner(base, lasting), list[ScenarioError]()
-            # The first, the middle or the last run can be built.
-            for index in dict.fromkeys((0, len(chosen) // 2, len(chosen) - 1)):
-                try:
-                    runner.check(chosen[index])
-                    break
-                except ScenarioError as error:
-                    errors.append(error)
-            else:
-                raise errors[0]
+            Runner(base, lasting).check(chosen[0])
         with open_journal(path, head) as journal:
-            # Runs of one structure follow each other, so that a process keeps its loop.
+            done = {run for run, result in journal.results().items() if result.outcome.is_final}
             order = sorted(range(len(chosen)), key=structures.__getitem__)
-            todo = [run for run in order if not journal.is_done(run)]
+            todo = [run for run in order if run not in done]
             if todo:
-                count = min(workers or num_cores(), len(todo))
-                opened: AbstractContextManager[Submit] = (
-                    _processes(count, time_limit, BUILDS if num_structures > BUILDS else 0)
-                    if executor is None
-                    else nullcontext(lambda *args: executor.submit(run_one, *args))
-                )
-                ahead = 4 * count if executor is None else AHEAD
-                size = {"total": len(chosen), "initial": len(chosen) - len(todo), "unit": "run"}
+                count, ahead = min(workers or num_cores(), len(todo)), AHEAD
+                opened: AbstractContextManager[Submit]
+                if executor is None:
+                    most = BUILDS if num_structures > BUILDS else 0
+                    ahead, opened = 4 * count, _processes(count, time_limit, most)
+                else:
+                    opened = nullcontext(lambda *args: executor.submit(run_one, *args))
+                size = {"total": len(chosen), "initial": len(done), "unit": "run"}
                 is_hidden = None if progress else True  # None: without a terminal.
                 with opened as submit, tqdm(**size, disable=is_hidden, **default_size()) as bar:
                     _run(todo, lambda run: submit(settings, chosen[run]), ahead, journal, bar)
@@ -165,16 +154,13 @@ def _run(
     bar: Any,
 ) -> None:
     """Makes runs, at most so many at a time, and writes their results when they end."""
-    waiting, running = list(todo)[::-1], dict[Future[RunResult], int]()
+    waiting, running = [*todo][::-1], dict[Future[RunResult], int]()
     try:
         while waiting or running:
             while waiting and len(running) < ahead:
                 run = waiting.pop()
-                if journal.is_done(run):  # By another process meanwhile.
-                    bar.update()
-                else:
-                    running[submit(run)] = run
-            ended = wait(running, return_when=FIRST_COMPLETED).done
+                running[submit(run)] = run
+            ended = wait_for(running, return_when=FIRST_COMPLETED).done
             journal.add({running.pop(future): _result(future) for future in ended})
             bar.update(len(ended))
     finally:
@@ -194,7 +180,11 @@ def _result(future: "Future[RunResult]") -> RunResult:
     except ProcessExpired as error:
         return RunResult(Outcome.CRASHED, f"its process ended with exit code {error.exitcode}")
     except (Exception, CancelledError) as error:
-        return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
+        return _crash(error)
+
+
+def _crash(error: BaseException) -> RunResult:
+    return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
 
 
 @contextmanager
@@ -207,7 +197,7 @@ def _processes(count: int, time_limit: float, most: int) -> Iterator[Submit]:
     finally:
         pool.stop()  # type: ignore[no-untyped-call]
         # The pool closes its channels first, which a process that is just starting would report.
-        for process in filter(_Process.is_alive, list(context.started)):
+        for process in filter(_Process.is_alive, context.started):
             process.kill()
         pool.join()
 
@@ -217,7 +207,7 @@ def _begin() -> None:
     tqdm.set_lock(RLock())
 
 
-class _Process(multiprocessing.context.SpawnProcess):
+class _Process(SpawnProcess):
     """A new interpreter that does not import the caller's script, which so needs no guard."""
 
     def start(self) -> None:
@@ -229,78 +219,39 @@ class _Process(multiprocessing.context.SpawnProcess):
             sys.modules["__main__"] = main
 
 
-class _WithoutMain(multiprocessing.context.SpawnContext):
+class _WithoutMain(SpawnContext):
     def __init__(self) -> None:
         self.started: list[_Process] = []
 
     def Process(self, **settings: Any) -> _Process:  # type: ignore[override]
         """A process as the pool wants it; it is started next."""
-        self.started = [process for process in self.started if process.is_alive()]
         self.started.append(_Process(**settings))
         return self.started[-1]
 
 
-def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
-    """Checks keys and values, of some variations if there are many."""
-    if not variations:
-        raise ScenarioError(("", "a sweep needs at least one variation"))
-    problems: dict[tuple[str, str], None] = {}
-    for changes in variations[:: -(-len(variations) // CHECKED)]:
-        try:
-            read_scenario(varied_data(base, changes))
-        except ScenarioError as error:
-            problems.update(dict.fromkeys(error.problems))
-    if problems:
-        raise ScenarioError(*problems)
-
-
-_TABLES = """
-CREATE TABLE IF NOT EXISTS sweep (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS runs (
-    run INTEGER PRIMARY KEY, outcome TEXT NOT NULL, reason TEXT NOT NULL,
-    figures TEXT NOT NULL, exceeded TEXT NOT NULL
-);
-"""
-
-# The outcomes of runs that are tried again, in SQL.
-_AGAIN = f"({', '.join(repr(str(each)) for each in Outcome if not each.is_final)})"
-
-
 class Journal:
-    """An open file of a sweep. Several processes may have it open; none loses a row of another."""
+    """An open file of a sweep, with a row for each run that has ended."""
 
     def __init__(self, database: sqlite3.Connection) -> None:
         self._database = database
 
     def add(self, results: Mapping[int, RunResult]) -> None:
-        """Writes results; a result that is already there stays, unless it is not final."""
-        rows = [
-            (run, r.outcome, r.reason, json.dumps(dict(r.figures)), json.dumps(r.exceeded))
-            for run, r in results.items()
-        ]
-        self._database.executemany(
-            "INSERT INTO runs VALUES (?, ?, ?, ?, ?) ON CONFLICT (run) DO UPDATE SET "
-            "outcome = excluded.outcome, reason = excluded.reason, figures = excluded.figures, "
-            f"exceeded = excluded.exceeded WHERE outcome IN {_AGAIN}",
-            rows,
-        )
+        """Writes results, in the place of those that the runs have."""
+        rows = [(run, json.dumps(asdict(result))) for run, result in results.items()]
+        self._database.executemany("INSERT OR REPLACE INTO runs VALUES (?, ?)", rows)
         self._database.commit()
-
-    def is_done(self, run: int) -> bool:
-        """Whether the run has a final result."""
-        query = f"SELECT 1 FROM runs WHERE run = ? AND outcome NOT IN {_AGAIN}"
-        return self._database.execute(query, [run]).fetchone() is not None
 
     def results(self) -> dict[int, RunResult]:
         """Number of a run -> its result."""
-        return {
-            run: RunResult(Outcome(outcome), reason, json.loads(figures), tuple(json.loads(left)))
-            for run, outcome, reason, figures, left in self._database.execute("SELECT * FROM runs")
-        }
+        results = dict[int, RunResult]()
+        for run, text in self._database.execute("SELECT run, result FROM runs"):
+            found = json.loads(text)
+            results[run] = RunResult(**{**found, "outcome": Outcome(found["outcome"])})
+        return results
 
 
 @contextmanager
-def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
+def open_journal(path: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
     """Creates the file of a sweep with missing folders, or opens that with an equal `head`."""
     unusable = f"cannot use {brief(str(path))} as the file of a sweep: "
     try:
@@ -310,17 +261,17 @@ def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
         raise ModelError(f"{unusable}{error}") from None
     with closing(database):
         try:
-            database.executescript(f"BEGIN IMMEDIATE; {_TABLES}")
-            there = dict(database.execute("SELECT key, value FROM sweep"))
-            if not there:
-                database.executemany("INSERT INTO sweep VALUES (?, ?)", list(head.items()))
+            for name in ("sweep (key TEXT PRIMARY KEY, value)", "runs (run PRIMARY KEY, result)"):
+                database.execute(f"CREATE TABLE IF NOT EXISTS {name}")
+            here = {key: json.dumps(value) for key, value in head.items()}
+            there = dict(database.execute("SELECT key, value FROM sweep")) or here
+            database.executemany("INSERT OR REPLACE INTO sweep VALUES (?, ?)", [*there.items()])
             database.commit()
-            differing = [
-                f"{key} = {brief(there.get(key))} there, {brief(head.get(key))} here"
-                for key in {**there, **head}
-                if there and there.get(key) != head.get(key)
-            ]
-            if differing:
+            if differing := [
+                f"{key} = {brief(there.get(key))} there, {brief(here.get(key))} here"
+                for key in {**there, **here}
+                if there.get(key) != here.get(key)
+            ]:
                 raise ModelError(
                     f"'{path}' belongs to another sweep: {'; '.join(differing[:6])}. Choose "
                     "another folder, or remove it"
@@ -332,8 +283,8 @@ def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
 
 # Keys whose values are set in a context, for any scenario.
 _OF_A_RUN = (
-    r"description|duration|judgement\.may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?|"
-    r"sensors\.(encoders\.seed|force\.(seed|bias|drift))"
+    r"description|duration|judgement\.may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?",
+    r"sensors\.(encoders\.seed|force\.(seed|bias|drift))",
 )
 
 
@@ -343,17 +294,15 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
     The other values are set in a context, so that runs with the same part share one loop: start,
     duration and integrator, parameters of the plant, gains that couple no outputs, seeds.
     """
-    plant = base.plant
-    patterns = [_OF_A_RUN, *(rf"start\.positions\.{re.escape(q)}" for q in base.start.positions)]
-    if not base.is_advised:
-        patterns += [rf"plant\.{re.escape(name)}" for name in plant.in_context]
-    elif "friction" in plant.in_context:  # No gains are computed from it.
-        patterns.append(r"plant\.friction")
+    plant, is_advised = base.plant, base.is_advised  # Such gains are computed from the plant.
+    patterns = [*_OF_A_RUN, *(rf"start\.positions\.{re.escape(q)}" for q in base.start.positions)]
+    numbers = [name for name in plant.in_context if not is_advised or name == "friction"]
+    patterns += [rf"plant\.{re.escape(name)}" for name in numbers]
     if not plant.carries:
         patterns.append(r"plant\.parameters(\..+)?")
     if plant.adjusts and not plant.carries:
         patterns.append(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
-    if not (isinstance(base.law.gains, Matrices) or base.is_advised or base.task is not None):
+    if not (isinstance(base.law.gains, Matrices) or is_advised or base.task is not None):
         patterns.append(r"law\.gains\..+")
         if base.sensors.force_noise:
             patterns.append(r"sensors\.force\.noise_deviation")
@@ -374,36 +323,30 @@ class Runner:
         self._base, self._lasting, self.builds = base, lasting, 0
         self._scenario = self._read({})
         self._structure: Variation | None = None
-        self._loop: ClosedLoop | DrakeDaeError | None = None
+        self._loop: tuple[ClosedLoop, SignalLimits] | DrakeDaeError | None = None
 
     def run(self, variation: Variation) -> RunResult:
         """The result of a run, whatever happens in it."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Each run would report the same.
-                scenario, loop = self._built(variation)
-                try:
-                    context = start_scenario(scenario, loop)
-                    record, steps, failure = self._simulated(scenario, loop, context)
-                except DrakeDaeError as error:
-                    outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
-                    return RunResult(outcome, str(error))
+                scenario, loop, limits = self._built(variation)
+                context = start_scenario(scenario, loop)
+                record, steps, failure = self._simulated(scenario, loop, context)
         except DrakeDaeError as error:
             return RunResult(Outcome.REFUSED, str(error))
         except Exception as error:  # A sweep of thousands of runs goes on.
-            return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
-        limits = _limits(loop)
+            return _crash(error)
         ranges = limits.ranges(record.time, limits.of_record(record))
         figures = figures_of(record, ranges)
-        exceeded = tuple(r.signal.name for r in ranges if r.excess)
         if failure is not None:
-            return RunResult(Outcome.FAILED, str(failure), figures, exceeded)
-        return RunResult(Outcome.FINISHED, "", {**figures, "steps": float(steps)}, exceeded)
+            return RunResult(Outcome.FAILED, str(failure), figures)
+        return RunResult(Outcome.FINISHED, "", {**figures, "steps": float(steps)})
 
     def check(self, variation: Variation) -> None:
         """Checks keys and values of a variation; that it starts is no question here."""
         try:
-            scenario, loop = self._built(variation)
+            scenario, loop, _ = self._built(variation)
             if self._lasting is not None:
                 program_of(loop)
             start_scenario(scenario, loop)
@@ -417,19 +360,20 @@ class Runner:
         scenario = read_scenario(varied_data(self._base, variation))
         return scenario if self._lasting is None else for_rollout(scenario)[0]
 
-    def _built(self, variation: Variation) -> tuple[Scenario, ClosedLoop]:
-        """The scenario of a run and its closed loop, which is built if the structure changed."""
+    def _built(self, variation: Variation) -> tuple[Scenario, ClosedLoop, SignalLimits]:
+        """The scenario of a run, and its closed loop, which is built if the structure changed."""
         scenario, structure = self._read(variation), structure_of(variation, self._scenario)
         if structure != self._structure or self._loop is None:
             self._structure, self._loop = structure, None
             self.builds += 1
             try:
-                self._loop = build_completed(self._read(structure))[1]
+                loop = build_completed(self._read(structure))[1]
+                self._loop = loop, robot_limits(loop.plant.robot("a sweep"))
             except DrakeDaeError as error:
                 self._loop = error
         if isinstance(self._loop, DrakeDaeError):
             raise self._loop
-        return scenario, self._loop
+        return scenario, *self._loop
 
     def _simulated(
         self, scenario: Scenario, loop: ClosedLoop, context: Context
@@ -448,11 +392,6 @@ class Runner:
         except SimulationError as error:
             failure = error
         return loop.record(context), steps, failure
-
-
-@lru_cache(maxsize=1)
-def _limits(loop: ClosedLoop) -> SignalLimits:
-    return robot_limits(loop.plant.robot("a sweep"))
 
 
 def _is_about_states(error: BaseException | None) -> bool:

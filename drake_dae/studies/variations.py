@@ -20,7 +20,7 @@ MOST_RUNS = 1_000_000  # The largest number of runs of a sweep; more would take 
 Variation = dict[str, Any]  # Dotted key of a scenario -> its value in one run, as plain data.
 
 _NUMBER = r"([-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)"
-_INTERVAL = re.compile(rf"\s*{_NUMBER}\.\.{_NUMBER}(?::([0-9]{{1,9}}))?\s*")
+_INTERVAL = re.compile(rf"\s*{_NUMBER}\.\.{_NUMBER}(?::([0-9]{{1,6}}))?\s*")
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -36,13 +36,13 @@ def make_variations(
     values of the smaller one. Without a count there is a run for every combination, in which the
     last key changes fastest, or with `together` for the i-th value of each key.
     """
-    for what, number, least in (("count", count, 1), ("seed", seed, 0)):
+    for what, number, least in (("count", 1 if count is None else count, 1), ("seed", seed, 0)):
         try:
-            check_whole_number(what, 1 if number is None else number, least)
+            check_whole_number(what, number, least)
         except ValueError as error:
             raise ScenarioError(("", str(error))) from None
+    _check_count(count or 1)
     if count is not None:
-        _check_count(count)
         columns = {key: _drawn(key, given, count, seed) for key, given in values.items()}
         return [{key: column[i] for key, column in columns.items()} for i in range(count)]
     columns = {key: _listed(key, given) for key, given in values.items()}
@@ -62,8 +62,8 @@ def parse_variations(
     """The variations of options "KEY=VALUES" of the command line: VALUES is YAML or a range."""
     columns = dict[str, Any]()
     for text in texts:
-        key, separator, values = text.partition("=")
-        if not (separator and values.strip() and all(key.split("."))):
+        key, _, values = text.partition("=")
+        if not (values.strip() and all(key.split("."))):
             wanted = "expected KEY=VALUES, for example start.errors.tool.z=0..0.05:6"
             raise ScenarioError((f"--vary {text}", wanted))
         if key in columns:
@@ -74,20 +74,19 @@ def parse_variations(
 
 
 def _listed(key: str, values: Any) -> list[Any]:
-    """The values of a key in a grid."""
-    interval = _INTERVAL.fullmatch(values) if isinstance(values, str) else None
-    if interval is None:
-        return _choices(key, values)
-    low, high = _ends(key, interval)
-    if not interval[3]:
-        text = f"{values} needs the number of its values, {values}:11, or random values"
-        raise ScenarioError((key, text))
-    if int(interval[3]) < 2:
-        raise ScenarioError((key, f"a range has at least 2 values, got {values}"))
-    _check_count(int(interval[3]))
-    found = np.linspace(low, high, int(interval[3])).tolist()
-    is_whole = all(value.is_integer() for value in found)
-    return [int(value) for value in found] if is_whole else found
+    """The values of a key in a grid, as plain data."""
+    if (interval := _interval(key, values)) is not None:
+        low, high, number = interval
+        if number < 2:
+            text = f"{values} needs the number of its values, {values}:11, or random values"
+            raise ScenarioError((key, text if not number else f"at least 2 values, got {values}"))
+        found = np.linspace(low, high, number).tolist()
+        is_whole = all(value.is_integer() for value in found)
+        return [int(value) for value in found] if is_whole else found
+    listed = plain(key, list(values) if isinstance(values, range) else values)
+    if not isinstance(listed, list) or not listed:
+        raise ScenarioError((key, f"expected a list of values, got {brief(values)}"))
+    return listed
 
 
 def _drawn(key: str, values: Any, count: int, seed: int) -> list[Any]:
@@ -104,16 +103,16 @@ def _drawn(key: str, values: Any, count: int, seed: int) -> list[Any]:
             return [filled(entry, f"{path}.{i}", run) for i, entry in enumerate(value)]
         if isinstance(value, dict):
             return {name: filled(entry, f"{path}.{name}", run) for name, entry in value.items()}
-        interval = _INTERVAL.fullmatch(value) if isinstance(value, str) else None
-        if not interval or interval[3]:
+        interval = _interval(key, value)
+        if interval is None or interval[2]:
             return value
-        (low, high), share = _ends(key, interval), fractions(path)[run].item()
+        (low, high, _), share = interval, fractions(path)[run].item()
         if key.endswith("seed"):
             return int(low) + min(int((int(high) - int(low) + 1) * share), int(high) - int(low))
         return low * (1.0 - share) + high * share
 
-    interval = _INTERVAL.fullmatch(values) if isinstance(values, str) else None
-    if interval and not interval[3]:
+    interval = _interval(key, values)
+    if interval is not None and not interval[2]:
         return [filled(values, key, run) for run in range(count)]
     choices = _listed(key, values)  # Of so many values, some are drawn.
     shares = fractions(key) if len(choices) > 1 else np.zeros(count)
@@ -121,26 +120,15 @@ def _drawn(key: str, values: Any, count: int, seed: int) -> list[Any]:
     return [filled(choices[place], key, run) for run, place in enumerate(places)]
 
 
-def _choices(key: str, values: Any) -> list[Any]:
-    """The values of a key as plain data."""
-    if isinstance(values, np.ndarray) and values.ndim:
-        values = list(values)
-    if not isinstance(values, (list, tuple, range)):
-        raise ScenarioError((key, f"expected a list of values, got {brief(values)}"))
-    if not values:
-        raise ScenarioError((key, "expected at least one value"))
-    if values[MOST_RUNS:]:
-        text = f"a sweep has at most {MOST_RUNS} runs, got {brief(values)}"
-        raise ScenarioError((key, text))
-    return [plain(key, value) for value in values]
-
-
-def _ends(key: str, interval: re.Match[str]) -> tuple[float, float]:
-    low, high = float(interval[1]), float(interval[2])
+def _interval(key: str, value: Any) -> tuple[float, float, int] | None:
+    """The ends and the count, 0 if there is none, in a text "LOW..HIGH:COUNT"."""
+    found = _INTERVAL.fullmatch(value) if isinstance(value, str) else None
+    if found is None:
+        return None
+    low, high = float(found[1]), float(found[2])
     if not (low < high and isfinite(high - low)):
-        text = "is empty" if low >= high else "is wider than the largest number"
-        raise ScenarioError((key, f"the range from {low:g} to {high:g} {text}"))
-    return low, high
+        raise ScenarioError((key, f"the range {value} is empty, or wider than any number"))
+    return low, high, int(found[3] or 0)
 
 
 def plain(key: str, value: Any) -> Any:

@@ -102,7 +102,7 @@ def test_it_leaves_its_files_and_tells_programs_and_people(tmp_path, monkeypatch
     words = ["sweep", "two_link_wall", "--workers=1", "--vary=start.errors.tool.z=[0, 0.01, 9]"]
     assert main([*words, *SHORT, "--json", "--check"]) == 2
     found = json.loads(capsys.readouterr().out)
-    assert found["outcomes"] == {"finished": 2, "no start": 1}
+    assert found["outcomes"] == {"finished": 2, "refused": 1}
     assert [run["run"] for run in found["not_finished"]] == [2]
     extent = found["figures"]["largest error of tool.z [m]"]
     assert 0.0 <= extent["least"] <= extent["median"] <= extent["largest"] < 0.1

@@ -10,9 +10,9 @@ from drake_dae.studies.sweep import open_journal
 
 HEAD = {"version": "1.0", "duration": "1.0", "variations": "[1, 2, 3]"}
 RESULTS = {
-    2: RunResult(Outcome.FINISHED, "", {"end [s]": 0.1 + 0.2}, ("wall.force",)),
+    2: RunResult(Outcome.FINISHED, "", {"end [s]": 0.1 + 0.2}),
     0: RunResult(Outcome.FAILED, 'über "alles"\n', {"end [s]": 1e-300}),
-    1: RunResult(Outcome.NO_START, "out of reach"),
+    1: RunResult(Outcome.REFUSED, "out of reach"),
 }
 
 
@@ -23,21 +23,9 @@ def test_it_reads_what_it_wrote(tmp_path):
         journal.add(RESULTS)
     with open_journal(path, HEAD) as journal:
         assert journal.results() == RESULTS
-        assert all(map(journal.is_done, RESULTS))
-        assert not journal.is_done(3)
+        journal.add({1: RunResult(Outcome.FINISHED)})
+        assert journal.results() == {**RESULTS, 1: RunResult(Outcome.FINISHED)}
     assert [found.name for found in path.parent.iterdir()] == ["runs.db"]
-
-
-def test_a_result_stays_as_it_was_told_first_unless_its_process_died(tmp_path):
-    path = tmp_path / "runs.db"
-    died = {1: RunResult(Outcome.CRASHED, "died"), 0: RunResult(Outcome.TIMED_OUT, "slow")}
-    with open_journal(path, HEAD) as journal:
-        journal.add(died)
-        assert journal.results() == died
-        assert not journal.is_done(1)
-        journal.add(RESULTS)
-        journal.add({**died, 2: RunResult(Outcome.FAILED, "another machine")})
-        assert journal.results() == RESULTS
 
 
 @pytest.mark.parametrize(

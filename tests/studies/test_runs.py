@@ -151,7 +151,7 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
     base = scenario_data(scenario("two_link_wall", *SHORT))
     far = {"references.tool.z.offset": 1.0, "references.tool.z.amplitudes": [0.9], "duration": 2.0}
     cases = [
-        ({"start.errors.tool.z": 3.0}, Outcome.NO_START, "tool.z"),
+        ({"start.errors.tool.z": 3.0}, Outcome.REFUSED, "tool.z"),
         ({"start.positions.joint1": 9.0}, Outcome.REFUSED, "joint1"),
         ({"law.gains": {"_tag": "!Coefficients", "all": [1.0]}}, Outcome.REFUSED, "gains: "),
         ({"duration": -1.0}, Outcome.REFUSED, "duration"),

@@ -79,8 +79,10 @@ def test_it_continues_with_what_is_missing_and_runs_nothing_again(study, whole, 
     file = shutil.copy(whole, tmp_path)
     with closing(sqlite3.connect(file)) as database:
         database.execute("DELETE FROM runs WHERE run = 3")
-        # What has ended stays as it is.
-        database.execute("UPDATE runs SET reason = 'mine' WHERE run = 4")
+        # What has ended stays as it is; what died is made again.
+        for run, outcome in ((2, "crashed"), (4, "finished")):
+            text = json.dumps({"outcome": outcome, "reason": "mine", "figures": {}})
+            database.execute("UPDATE runs SET result = ? WHERE run = ?", (text, run))
         database.commit()
     again = dd.sweep(chosen(), VARIATIONS, file, workers=1)
     assert again.results[4].reason == "mine"
@@ -236,7 +238,7 @@ def test_a_run_without_end_is_ended_at_the_limit(tmp_path):
         "3 runs: 2 finished, 1 timed out run 1, integrator.target_realtime_rate"
     )
     assert ": timed out: " in words
-    assert "1 run died or took too long; the same command tries again: 1" in error
+    assert "runs 1 died or took too long; the same command tries again" in error
 
 
 @pytest.mark.slow
@@ -264,17 +266,16 @@ def test_what_cannot_be_is_reported_before_anything_runs(variations, words, tmp_
 # What it says and draws.
 
 
-def made(outcomes=("finished", "failed", "finished", "no start")):
+def made(outcomes=("finished", "failed", "finished", "refused")):
     """A study of which all is known."""
     variations, results = [], []
     for run, outcome in enumerate(outcomes):
         figures = (
-            {"largest error of z [m]": 0.1 * run, "steps": 7.0} if outcome != "no start" else {}
+            {"largest error of z [m]": 0.1 * run, "steps": 7.0} if outcome != "refused" else {}
         )
-        left = ("motor",) if run == 2 else ()
         reason = "" if outcome == "finished" else "it cannot go on"
         variations.append({"a": run // 2, "b": [float(run % 2)]})
-        results.append(RunResult(Outcome(outcome), reason, figures, left))
+        results.append(RunResult(Outcome(outcome), reason, figures))
     return Study(tuple(variations), tuple(results))
 
 
@@ -284,20 +285,18 @@ def test_the_table_and_the_summary():
         "run": [0, 1, 2, 3],
         "a": [0, 0, 1, 1],
         "b": [[0.0], [1.0], [0.0], [1.0]],
-        "outcome": ["finished", "failed", "finished", "no start"],
+        "outcome": ["finished", "failed", "finished", "refused"],
         "reason": ["", "it cannot go on", "", "it cannot go on"],
-        "beyond limits": ["", "", "motor", ""],
         "largest error of z [m]": [0.0, 0.1, 0.2, None],
         "steps": [7.0, 7.0, 7.0, None],
     }
     text = str(study)
-    assert text.startswith("4 runs: 2 finished, 1 failed, 1 no start\n")
+    assert text.startswith("4 runs: 2 finished, 1 failed, 1 refused\n")
     assert "run 1, a=0, b=[1.0]: failed: it cannot go on\n" in text
-    assert "run 3, a=1, b=[1.0]: no start: it cannot go on\n" in text
-    assert "beyond their limits: motor in 1 run\n" in text
+    assert "run 3, a=1, b=[1.0]: refused: it cannot go on\n" in text
     row = next(line.split() for line in text.splitlines() if line.startswith("largest error"))
     assert row[-5:] == ["0", "0", "0.1", "0.2", "2"]
-    assert repr(study) == "Study(4 runs: 2 finished, 1 failed, 1 no start)"
+    assert repr(study) == "Study(4 runs: 2 finished, 1 failed, 1 refused)"
     np.testing.assert_array_equal(study.values("steps"), [7.0, 7.0, 7.0, np.nan])
     with pytest.raises(ModelError, match=r"'step'.*'steps'"):
         study.values("step")
@@ -310,7 +309,7 @@ def test_it_leaves_its_files(tmp_path):
     with open(written[0], newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert (rows[3]["b"], rows[3]["largest error of z [m]"], rows[3]["outcome"]) == (
-        "[1.0]", "", "no start",
+        "[1.0]", "", "refused",
     )  # fmt: skip
 
 
@@ -320,4 +319,4 @@ def test_the_plot_has_each_figure_that_varies_over_the_first_key_that_does():
     points, crosses = axis.lines
     np.testing.assert_array_equal(points.get_xydata()[:3], [[0.0, 0.0], [0.0, 0.1], [1.0, 0.2]])
     np.testing.assert_array_equal(crosses.get_xdata(), [0.0, 1.0])
-    assert made(("no start", "no start")).plot().axes == []
+    assert made(("refused", "refused")).plot().axes == []

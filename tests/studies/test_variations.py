@@ -128,7 +128,7 @@ def test_what_cannot_be_read_is_reported(texts, options, words):
         ({"a": range(0)}, 2, r"\ba\b"),
         ({"a": "text"}, 2, r"\ba\b"),
         ({"a": [object()]}, 2, r"\ba\b"),
-        ({"a": range(10**300)}, None, "1000000"),
+        ({"a": "1..2:1000000"}, None, r"\ba\b"),
     ],
 )
 def test_ranges_that_make_no_sense_are_refused(values, count, words):

@@ -4,7 +4,6 @@ It has no loops in continuous time, so only mechanisms whose closures are the jo
 be written: free bodies, each pinned to the world or to another one.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -90,14 +89,9 @@ def forces(
         simulator.AdvanceTo(duration)
     reactions = plant.get_reaction_forces_output_port().Eval(context)
     found = {}
-    for closure, number in zip(mechanism.closures, first_turns(tree), strict=True):
-        joint = plant.GetJointByName(f"j{number}")
+    for closure, body in zip(mechanism.closures, tree.bodies, strict=True):
+        joint = plant.GetJointByName(f"j{tree.first_joint(body.name)}")
         rotation = joint.frame_on_child().CalcRotationMatrixInWorld(context)
         force = rotation @ reactions[int(joint.index())].translational()
         found[closure.name] = force[["xyz".index(axis) for axis in closure.axes]]
     return found
-
-
-def first_turns(tree: Mechanism) -> Iterator[int]:
-    """The number of the first joint of each body."""
-    return (tree.first_joint(body.name) for body in tree.bodies)

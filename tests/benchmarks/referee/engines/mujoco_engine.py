@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from referee.description import Body, Closure, Mechanism
+from referee.description import Closure, Mechanism
 
 NAME = "MuJoCo"
 NOTE = (
@@ -33,25 +33,8 @@ def numbers(values: object) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def body_xml(mechanism: Mechanism, body: Body, geoms: dict[str, list[str]]) -> str:
-    """A body with its joints, sites and children."""
-    first = mechanism.first_joint(body.name)
-    kinds = {"turn": "hinge", "slide": "slide"}
-    lines = [f'<body name="{body.name}" pos="{numbers(body.at)}">']
-    lines += [
-        f'<joint name="j{first + k}" type="{kinds[kind]}" axis="{numbers(axis)}"/>'
-        for k, (kind, axis) in enumerate(body.joints)
-    ]
-    lines.append(
-        f'<inertial pos="{numbers(body.center)}" mass="{body.mass!r}" '
-        f'diaginertia="{numbers(body.inertia)}"/>'
-    )
-    lines += inside(mechanism, body.name, geoms)
-    return "".join([*lines, "</body>"])
-
-
-def inside(mechanism: Mechanism, name: str, geoms: dict[str, list[str]]) -> list[str]:
-    """Sites, geometry and children of a body."""
+def inside(mechanism: Mechanism, name: str, geoms: dict[str, list[str]]) -> str:
+    """Sites, geometry and children of a body, in MJCF."""
     lines = list(geoms.get(name, []))
     ends = [(c.name, c.body_a, c.point_a, c.body_b, c.point_b) for c in mechanism.closures]
     ends += [
@@ -62,8 +45,19 @@ def inside(mechanism: Mechanism, name: str, geoms: dict[str, list[str]]) -> list
         for suffix, body, point in (("a", body_a, point_a), ("b", body_b, point_b)):
             if body == name:
                 lines.append(f'<site name="{own}_{suffix}" pos="{numbers(point)}"/>')
-    children = [body for body in mechanism.bodies if body.parent == name]
-    return lines + [body_xml(mechanism, child, geoms) for child in children]
+    for body in mechanism.bodies:
+        if body.parent != name:
+            continue
+        lines.append(f'<body name="{body.name}" pos="{numbers(body.at)}">')
+        for number, (kind, axis) in enumerate(body.joints, mechanism.first_joint(body.name)):
+            kind = {"turn": "hinge", "slide": "slide"}[kind]
+            lines.append(f'<joint name="j{number}" type="{kind}" axis="{numbers(axis)}"/>')
+        lines.append(
+            f'<inertial pos="{numbers(body.center)}" mass="{body.mass!r}" '
+            f'diaginertia="{numbers(body.inertia)}"/>'
+        )
+        lines += [inside(mechanism, body.name, geoms), "</body>"]
+    return "".join(lines)
 
 
 def equality(mechanism: Mechanism, closure: Closure) -> str:
@@ -73,8 +67,6 @@ def equality(mechanism: Mechanism, closure: Closure) -> str:
         return f'<connect name="{name}" {sites} {HARD}/>'
     if closure.kind == "weld":
         return f'<weld name="{name}" {sites} {HARD}/>'
-    if closure.kind == "distance":
-        return f'<tendon name="{name}" tendon1="{name}" {HARD}/>'
     if closure.kind == "gear":
         leader, follower = (
             mechanism.first_joint(body) for body in (closure.body_a, closure.body_b)
@@ -87,11 +79,6 @@ def equality(mechanism: Mechanism, closure: Closure) -> str:
 def xml(mechanism: Mechanism, geoms: dict[str, list[str]]) -> str:
     """The mechanism in MJCF."""
     tendons = [
-        f'<spatial name="{c.name}"><site site="{c.name}_a"/><site site="{c.name}_b"/></spatial>'
-        for c in mechanism.closures
-        if c.kind == "distance"
-    ]
-    tendons += [
         f'<spatial name="spring{i}" stiffness="{s.stiffness!r}" springlength="{s.length!r}">'
         f'<site site="spring{i}_a"/><site site="spring{i}_b"/></spatial>'
         for i, s in enumerate(mechanism.springs)
@@ -100,7 +87,7 @@ def xml(mechanism: Mechanism, geoms: dict[str, list[str]]) -> str:
         <option gravity="{numbers(mechanism.gravity)}" solver="Newton" cone="elliptic"
           tolerance="1e-15" iterations="1000" ls_iterations="1000" ls_tolerance="1e-12"
           jacobian="dense"/>
-        <worldbody>{"".join(inside(mechanism, "world", geoms))}</worldbody>
+        <worldbody>{inside(mechanism, "world", geoms)}</worldbody>
         <tendon>{"".join(tendons)}</tendon>
         <equality>{"".join(equality(mechanism, c) for c in mechanism.closures)}</equality>
         <contact>{"".join(geoms.get("pairs", []))}</contact>
@@ -127,10 +114,6 @@ def solved(
         joint = model.joint(f"j{i}")
         data.qpos[joint.qposadr[0]], data.qvel[joint.dofadr[0]] = q[i], v[i]
         data.qfrc_applied[joint.dofadr[0]] = mechanism.torques.get(i, 0.0)
-    for closure in mechanism.closures:
-        if closure.kind == "distance":
-            length = model.tendon_length0[model.tendon(closure.name).id]
-            model.eq_data[model.equality(closure.name).id, 0] = closure.size - length
     for _ in range(STEPS if duration else 0):
         mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
@@ -224,10 +207,9 @@ def moment(
 
 def contact_force(model: mujoco.MjModel, data: mujoco.MjData, closure: Closure) -> np.ndarray:
     """The force of a contact on the body, in the world."""
+    target = data.site(f"{closure.name}_b").xpos
     if closure.kind == "ball":
-        target = data.site(f"{closure.name}_b").xpos - closure.size * np.array(closure.direction)
-    else:
-        target = data.site(f"{closure.name}_b").xpos
+        target = target - closure.size * np.array(closure.direction)
     if not data.ncon:
         raise NotImplementedError("the contact opened")
     near = min(range(data.ncon), key=lambda i: np.linalg.norm(data.contact[i].pos - target))
