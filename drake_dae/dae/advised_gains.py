@@ -1,6 +1,6 @@
 """Gains of law, observer and estimator for compliant contact and given sensors, as an optimum."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -140,26 +140,27 @@ def is_stable(situation: SensedContact, part: Part) -> bool:
     )
 
 
-def _free(situation: SensedContact, fast: float | None) -> list[Part]:
-    """The predictions for free directions with all rates, and that of an estimator, in 1/s."""
-    found = []
-    for w, (shape, damping) in product(_rates(situation), SHAPES):
-        if damping == 1.0 and shape * w < SLOWEST:
-            continue
-        gains = pole_gains(shape * w, damping, 3)
-        rates = DirectionGains((gains[0], gains[1], gains[2]), 0.0, shape * w / 0.75, fast)
-        found.append(Part.of(situation, w, rates, False))
-    return found
+def _groups(situation: SensedContact, fast: float | None, contact: bool) -> Iterator[list[Part]]:
+    """The predictions for all rates w, and that of an estimator, in free directions or a contact.
 
-
-def _along(situation: SensedContact, fast: float | None, share: float) -> list[Part]:
-    """The same along the contact, with a factor by which integral and observer are slowed."""
-    found = []
-    for w in _rates(situation):
-        c = min(2.3 * w, situation.best_damping)
-        rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
-        found.append(Part.of(situation, w, rates, True))
-    return found
+    Of a contact there is a group for each of `SLOWER`; the first one that has gains is taken.
+    """
+    if not contact:
+        free = []
+        for w, (shape, damping) in product(_rates(situation), SHAPES):
+            if damping < 1.0 or shape * w >= SLOWEST:
+                low, middle, high = pole_gains(shape * w, damping, 3)
+                rates = DirectionGains((low, middle, high), 0.0, shape * w / 0.75, fast)
+                free.append(Part.of(situation, w, rates, False))
+        yield free
+        return
+    for share in SLOWER:
+        along = []
+        for w in _rates(situation):
+            c = min(2.3 * w, situation.best_damping)
+            rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
+            along.append(Part.of(situation, w, rates, True))
+        yield along
 
 
 @dataclass(frozen=True)
@@ -272,55 +273,47 @@ def _state_rates(situation: SensedContact) -> list[float | None]:
 def _pair(
     situation: SensedContact, fast: float | None, roughness: float, most: tuple[float, float]
 ) -> tuple[Part, Part] | None:
-    """The best gains of free directions and of the contact, if there are any."""
+    """The best gains of free directions and of the contact, if there are any.
 
-    def free(allowed: float) -> Part | None:
-        return _best(situation, _free(situation, fast), allowed, most[0])
-
-    def contact(allowed: float) -> Part | None:
-        allowed = min(allowed, roughness / 2.0**0.5)
-        tried = (_along(situation, fast, share) for share in SLOWER)
-        best = (_best(situation, parts, allowed, most[1]) for parts in tried)
-        return next(filter(None, best), None)
-
+    The part of each has the least error, or the least roughness where its error is bounded, of
+    those that are smooth and stable enough.
+    """
+    found, left = dict[bool, Part](), roughness
     # The contact comes first, with at most its share of the roughness; but free directions do where
     # their error is bounded, since their smoothest gains leave the most.
-    is_free_first = most[0] < inf
-    first, second = (free, contact) if is_free_first else (contact, free)
-    if (one := first(roughness)) is None:
-        return None
-    if (other := second((roughness**2 - one.roughness**2) ** 0.5)) is None:
-        return None
-    return (one, other) if is_free_first else (other, one)
+    for contact in (True, False) if most[0] == inf else (False, True):
+        allowed = min(left, roughness / 2.0**0.5) if contact else left
+        for group in _groups(situation, fast, contact):
+            bound = most[contact]
+            within = [part for part in group if part.roughness <= allowed and part.error <= bound]
+            within.sort(key=lambda part: part.error if bound == inf else part.roughness)
+            best = next((part for part in within if is_stable(situation, part)), None)
+            if best is not None:
+                found[contact], left = best, (roughness**2 - best.roughness**2) ** 0.5
+                break
+        else:
+            return None
+    return found[False], found[True]
 
 
-def _best(situation: SensedContact, parts: list[Part], allowed: float, most: float) -> Part | None:
-    """The part with the least error that is smooth and stable enough, if there is one.
-
-    Where the error may be at most a number, it is the smoothest one within it.
-    """
-    within = [part for part in parts if part.roughness <= allowed and part.error <= most]
-    within.sort(key=lambda part: part.error if most == inf else part.roughness)
-    return next((part for part in within if is_stable(situation, part)), None)
+def _stable(situation: SensedContact, contact: bool) -> Iterator[Part]:
+    """All stable gains of free directions, or of the contact."""
+    for fast in _state_rates(situation):
+        for group in _groups(situation, fast, contact):
+            yield from (part for part in group if is_stable(situation, part))
 
 
 def settles_along(situation: SensedContact) -> bool:
     """Whether any gains are stable along the contact with a margin."""
-    tried = product(_state_rates(situation), SLOWER)
-    return any(is_stable(situation, part) for each in tried for part in _along(situation, *each))
+    return any(_stable(situation, True))
 
 
 def _reason(situation: SensedContact, roughness: float, most: tuple[float, float]) -> str:
     """Why no gains are found."""
-    fast = _state_rates(situation)
-    free = [part for each in fast for part in _free(situation, each)]
-    along = [part for each in product(fast, SLOWER) for part in _along(situation, *each)]
     smoothest = []
-    for parts, bound, where, unit in (
-        (free, most[0], "in free directions", "m"),
-        (along, most[1], "along the contact", "N"),
-    ):
-        stable = [part for part in parts if is_stable(situation, part)]
+    for contact in (False, True):
+        where, unit = ("along the contact", "N") if contact else ("in free directions", "m")
+        stable, bound = list(_stable(situation, contact)), most[contact]
         if not stable:
             return (
                 f"no gains are stable {where} with a margin, for a contact of "

@@ -157,22 +157,14 @@ def contact_damping(
     which is critically damped at c = 2 sqrt(A k). A changing reference force leaves an error of
     about c lambda_d' / (A k).
 
-    A sampled law holds -c phi' for a sample time T, from a measurement `delay` samples before.
-    Between samples the contact oscillates freely, so (phi, phi', the held value) follow from the
-    previous sample by a matrix. c minimizes its spectral radius. For a slow contact c is 2 w, with
-    w = sqrt(A k). Without contact a delay of one sample gives z^2 - z + c T = 0, which does not
-    oscillate up to c = 1 / (4 T) and is stable up to c = 1 / T; so c stays of this size. At w T of
-    about 1 the held value lags by a quarter of a period and does not damp any more; then c is 0,
-    and the contact needs damping of its own or a shorter sample time.
+    A sampled law holds -c phi' for a sample time T, from a measurement `delay` samples before, so
+    that (phi, phi', the held value) follow from the previous sample by a matrix. c minimizes its
+    spectral radius. For a slow contact c is 2 w, with w = sqrt(A k). At w T of about 1 the held
+    value lags by a quarter of a period and does not damp any more; then c is 0, and the contact
+    needs damping of its own or a shorter sample time.
 
-    Args:
-        stiffness: k in N/m, positive.
-        mobility: A(x) = J M^-1 J^T of the contact in 1/kg, positive; the largest along the motion.
-        sample_time: T in s; 0 for a law that runs continuously.
-        delay: The delay of the control in samples.
-
-    Returns:
-        c in 1/s, from 0 to 2 sqrt(A k).
+    The stiffness is k in N/m, the mobility A = J M^-1 J^T in 1/kg, the largest along the motion;
+    sample_time is T in s, 0 for a law that runs continuously, and c is in 1/s.
 
     Raises:
         ModelError: A number is not positive, or is negative.

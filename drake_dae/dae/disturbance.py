@@ -273,14 +273,12 @@ def _wanted(
 def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
     """x' of the states that a mass matrix depends on; inputs and disturbance must not enter it."""
     rate = ca.SX(system.num_states, 1)
-    pattern = ca.DM(ca.jacobian(ca.vec(mass), system.state).sparsity()).full()
-    others = ca.horzcat(system.g, system.h)
-    identity = ca.SX.eye(system.num_states)
-    for i in np.flatnonzero(pattern.any(axis=0)).tolist():
-        is_plain = ca.is_equal(
-            ca.sparsify(system.mass_matrix[i, :]), ca.sparsify(identity[i, :]), 2
-        )
-        if i in rows or not is_plain or ca.sparsify(others[i, :]).nnz():
+    others = system.mass_matrix - ca.SX.eye(system.num_states)
+    driven = ca.horzcat(others, system.g, system.h)
+    for i in range(system.num_states):
+        if not ca.depends_on(mass, system.state[i]):
+            continue
+        if i in rows or ca.sparsify(driven[i, :]).nnz():
             name = system.state_signals[i].name
             raise ModelError(
                 f"{system.name}: the mass that a disturbance accelerates depends on '{name}', "

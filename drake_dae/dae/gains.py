@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -93,8 +93,6 @@ class FeedbackGains:
         return result
 
 
-T = TypeVar("T")
-
 # A function that makes gains for outputs of given names and degrees.
 GainDesign = Callable[[Sequence[str], Sequence[int]], FeedbackGains]
 Poles = float | complex | Sequence[float | complex]
@@ -108,13 +106,7 @@ def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
         values: One pole in 1/s for all, or a sequence of mu_i poles for every output, or these per
             output name, "*" for all others. Complex poles come in conjugate pairs.
     """
-
-    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
-        chosen: list[tuple[str, int, Poles]] = _per_output(values, names, degrees)
-        polynomials = {name: _polynomial(name, degree, own) for name, degree, own in chosen}
-        return gain_coefficients(polynomials)(names, degrees)
-
-    return design
+    return _row_by_row(values, _polynomial)
 
 
 @checked(GainError)
@@ -122,23 +114,7 @@ def gain_coefficients(
     values: Sequence[float] | Mapping[str, float | Sequence[float]],
 ) -> GainDesign:
     """Designs the gains K_i1, ..., K_i mu_i of (32) from numbers, lowest derivative first."""
-
-    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
-        matrix, owners = np.zeros((len(names), sum(degrees))), DerivativeLayout(degrees).owners
-        chosen: list[tuple[str, int, float | Sequence[float]]]
-        chosen = _per_output(values, names, degrees)
-        for name, degree, row in chosen:
-            entries = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
-            if entries.shape != (degree,):
-                raise GainError(
-                    f"output '{name}' has degree {degree} and takes {degree} coefficients "
-                    f"K_i1, ..., K_i{degree}, got {entries.size}"
-                )
-            i = list(names).index(name)
-            matrix[i, owners == i] = entries
-        return FeedbackGains(tuple(names), tuple(degrees), matrix)
-
-    return design
+    return _row_by_row(values, _coefficients)
 
 
 def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
@@ -188,25 +164,32 @@ def designed(
     return gains
 
 
-def _per_output(
-    values: T | Mapping[str, T], names: Sequence[str], degrees: Sequence[int]
-) -> list[tuple[str, int, T]]:
-    """Returns name, degree and value of each output with a degree above 0."""
-    dynamic = [(name, degree) for name, degree in zip(names, degrees, strict=True) if degree]
-    if not isinstance(values, Mapping):
-        return [(name, degree, values) for name, degree in dynamic]
-    expected = [name for name, _ in dynamic]
-    wrong = [name for name in values if name not in (*expected, "*")]
-    missing = [name for name in expected if name not in values and "*" not in values]
-    if wrong or missing:
-        raise GainError(
-            f"gains are needed for the outputs {', '.join(expected)}, of degree 1 or more; not "
-            f"given: {', '.join(missing) or 'none'}; others: {', '.join(wrong) or 'none'}"
-        )
-    return [(name, degree, values[name if name in values else "*"]) for name, degree in dynamic]
+def _row_by_row(
+    values: Any, row_of: Callable[[str, int, Any], Sequence[float] | FloatArray]
+) -> GainDesign:
+    """Designs a row of K for each output with a degree above 0, by a value for all or for each."""
+
+    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
+        matrix, owners = np.zeros((len(names), sum(degrees))), DerivativeLayout(degrees).owners
+        needed = {name: degree for name, degree in zip(names, degrees, strict=True) if degree}
+        chosen = values if isinstance(values, Mapping) else {"*": values}
+        wrong = [name for name in chosen if name not in (*needed, "*")]
+        missing = [name for name in needed if name not in chosen and "*" not in chosen]
+        if wrong or missing:
+            raise GainError(
+                f"gains are needed for the outputs {', '.join(needed)}, of degree 1 or more; not "
+                f"given: {', '.join(missing) or 'none'}; others: {', '.join(wrong) or 'none'}"
+            )
+        for i, name in enumerate(names):
+            if name in needed:
+                value = chosen[name if name in chosen else "*"]
+                matrix[i, owners == i] = row_of(name, needed[name], value)
+        return FeedbackGains(tuple(names), tuple(degrees), matrix)
+
+    return design
 
 
-def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
+def _polynomial(name: str, degree: int, chosen: Poles) -> FloatArray:
     """K_i1, ..., K_i mu_i of the polynomial (32) with the chosen roots."""
     roots = np.atleast_1d(np.asarray(chosen, dtype=complex))
     if roots.size == 1:
@@ -218,4 +201,15 @@ def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
     monic = np.poly(roots)  # (32)
     if np.abs(np.imag(monic)).max() > 1e-12 * np.abs(monic).max():
         raise GainError(f"complex poles of output '{name}' must come in conjugate pairs: {roots}")
-    return [float(number) for number in np.real(monic)[:0:-1]]
+    return np.real(monic)[:0:-1]
+
+
+def _coefficients(name: str, degree: int, chosen: float | Sequence[float]) -> FloatArray:
+    """K_i1, ..., K_i mu_i as they are given."""
+    entries = np.atleast_1d(numbers(f"coefficients of output '{name}'", chosen, GainError))
+    if entries.shape != (degree,):
+        raise GainError(
+            f"output '{name}' has degree {degree} and takes {degree} coefficients "
+            f"K_i1, ..., K_i{degree}, got {entries.size}"
+        )
+    return entries

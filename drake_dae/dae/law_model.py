@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 import casadi as ca
 import numpy as np
@@ -43,28 +44,22 @@ def law_structure(
         force = force - deflection.symbol
     derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
     # The output chains of the same degrees along these derivatives.
-    degrees = structure.output_degrees
-    chains: list[list[ca.SX]] = [[] for _ in degrees]
-    highest, rows = ca.SX(len(degrees), 1), list(range(len(degrees)))
-    moving = system.outputs(derivatives.constraint_input)
-    for order in range(max(degrees, default=0) + 1):
-        values, _ = derivatives.by_control(moving)
-        for row, i in enumerate(rows):
-            if degrees[i] == order:
-                highest[i] = moving[row]
-            else:
-                chains[i].append(values[row])
-        remaining = [row for row, i in enumerate(rows) if degrees[i] > order]
-        rows = [rows[row] for row in remaining]
-        if rows:
-            moving = derivatives.derivative(moving[remaining])
-    drift, control_matrix = derivatives.by_control(highest)
+    highest, moving = list[ca.SX](), [ca.SX(0, 1)]
+    outputs = system.outputs(derivatives.constraint_input)
+    for row, degree in zip(ca.vertsplit(outputs), structure.output_degrees, strict=True):
+        for _ in range(degree):
+            moving.append(row)
+            row = derivatives.derivative(row)
+        highest.append(row)
+    values = iter(ca.vertsplit(derivatives.by_control(ca.vertcat(*moving))[0]))
+    chains = tuple(tuple(islice(values, degree)) for degree in structure.output_degrees)
+    drift, control_matrix = derivatives.by_control(ca.vertcat(*highest))
     return replace(
         structure,
         derivatives=derivatives,
         elimination=replace(eliminate(derivatives), n_star=structure.elimination.n_star),
-        output_chains=tuple(map(tuple, chains)),
-        highest_derivatives=highest,
+        output_chains=chains,
+        highest_derivatives=ca.vertcat(*highest),
         drift=drift,
         control_matrix=control_matrix,
     )

@@ -10,7 +10,6 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import NonFiniteError, ReferenceSignalError
-from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -61,26 +60,12 @@ class FormulaReference(Reference):
         """Returns r(t), shape (size, 1)."""
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
-        self.check_smoothness(degrees)
         values = []
         for row, degree in zip(ca.vertsplit(self.rows(time)), degrees, strict=True):
             values.append(row)
             for _ in range(degree):
                 values.append(ca.jacobian(values[-1], time))
         return ca.vertcat(*values)
-
-    def check_smoothness(self, degrees: Sequence[int]) -> None:
-        """Raises ReferenceSignalError if a row has no derivatives up to its degree."""
-        time = ca.SX.sym("t")
-        rows = self.rows(time)
-        others = [symbol for symbol in ca.symvar(rows) if not ca.is_equal(symbol, time)]
-        for i, degree in enumerate(degrees):
-            flaw = find_flaw(rows[i], time, ca.vertcat(ca.SX(0, 1), *others), "the time")
-            if degree and flaw:
-                raise ReferenceSignalError(
-                    f"row {i} of the reference {flaw}. The law needs {degree} "
-                    "derivatives of it; a move from rest to rest is a PointToPointReference"
-                )
 
 
 def check_order(order: int, least: int, most: int) -> None:

@@ -37,29 +37,6 @@ def test_noise_of_the_force_is_that_of_the_docstring():
 
 
 @pytest.mark.parametrize("sample_time", [2.5e-4, 1e-3, 4e-3])
-@pytest.mark.parametrize("noise", [0.0, 1e-3])
-def test_contact_that_is_sampled_late_comes_to_rest(sample_time, noise):
-    """All soft contacts, and stiff ones up to a swing of half a radian in a sample.
-
-    (phi, phi', the force's integral, what is held): phi'' = -A k phi + held, where the law of one
-    sample before holds A (r - K_i int e) - c phi'; the roots of its map are inside the circle.
-    """
-    for frequency in (10.0, 30.0, 100.0, 0.5 / sample_time):
-        mobility = 0.1
-        stiffness = frequency**2 / mobility
-        found = contact_gains(stiffness, mobility, sample_time, velocity_noise=noise)
-        if not found.constraint_damping:
-            continue
-        rates = np.array([[0.0, 1.0, 0.0], [-(frequency**2), 0.0, 1.0], [0.0, 0.0, 0.0]])
-        step = expm(rates * sample_time)[:2]
-        loop = np.zeros((4, 4))
-        loop[:2, [0, 1, 3]] = step
-        loop[2] = [-stiffness * sample_time, 0.0, 1.0, 0.0]
-        loop[3] = [0.0, -found.constraint_damping, found.force_gain * mobility, 0.0]
-        assert np.abs(np.linalg.eigvals(loop)).max() < 1.0, frequency
-
-
-@pytest.mark.parametrize("sample_time", [2.5e-4, 1e-3, 4e-3])
 def test_positions_that_are_sampled_late_come_to_rest(sample_time):
     """e'' = held, with the poles of one sample before; damped nearly as the poles without it.
 
