@@ -373,22 +373,21 @@ def _path(constraint: Constraint, part: str) -> list[str]:
 # ------------------------------------------------------------------ long functions in pieces
 
 # The largest number of assignments in a function. For 60,000 assignments, clang needs 180 s of CPU
-# in one function, and 9 s in pieces of 2,000, whose code is 40 % larger.
+# in one function, and seconds in pieces of 2,000.
 LONGEST = 2000
 
-_NAME = re.compile(r"\ba\d+\b")
+_NAME = re.compile(r"\ba0*(\d+)\b")
 _FUNCTION = re.compile(
     r"(?P<head>static int (?P<name>casadi_f\d+)\([^\n]*\{)\n(?P<body>(?:  [^\n]*\n)*)\}"
 )
 _DECLARATION = "  casadi_real a"
 _ARGUMENTS = (
-    "const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, "
-    "casadi_real* shared"
+    "const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, casadi_real* a"
 )
 
 
 def in_pieces(source: str, longest: int = LONGEST) -> str:
-    """Splits long functions of C into pieces that pass values on by the array `shared`."""
+    """Splits long functions of C into pieces, for which all variables are entries of one array."""
     return _FUNCTION.sub(lambda function: _split(function, longest), source)
 
 
@@ -400,35 +399,11 @@ def _split(function: re.Match[str], longest: int) -> str:
     ]
     if len(rows) <= longest:
         return function[0]
-    pieces = [rows[i : i + longest] for i in range(0, len(rows), longest)]
-    uses = [_uses(piece) for piece in pieces]
-    # needed[k]: the variables that piece k or a later one reads before a new assignment.
-    needed = [set[str]()]
-    for read, assigned in reversed(uses):
-        needed.insert(0, read | (needed[0] - assigned))
-    index = {variable: i for i, variable in enumerate(sorted(set().union(*needed)))}
-    name, text, calls = function["name"], "", ""
-    for k, (piece, (read, assigned)) in enumerate(zip(pieces, uses, strict=True)):
-        begin = [
-            f"  casadi_real {a}{f' = shared[{index[a]}]' if a in read else ''};"
-            for a in sorted(read | assigned)
-        ]
-        end = [f"  shared[{index[a]}] = {a};" for a in sorted(assigned & needed[k + 1])]
+    size = 1 + max(map(int, _NAME.findall(function["body"])))
+    name, text, calls = function["name"], "", f"  casadi_real a[{size}];\n"
+    for k, i in enumerate(range(0, len(rows), longest)):
+        piece = (_NAME.sub(r"a[\1]", row) for row in rows[i : i + longest])
         head = f"static int __attribute__((noinline)) {name}_{k}({_ARGUMENTS}) {{"
-        text += "\n".join([head, *begin, *piece, *end, "  return 0;", "}", "", ""])
-        calls += f"  if ({name}_{k}(arg, res, iw, w, shared)) return 1;\n"
-    shared = f"  casadi_real shared[{len(index) + 1}];\n"
-    return f"{text}{function['head']}\n{shared}{calls}  return 0;\n}}"
-
-
-def _uses(rows: Sequence[str]) -> tuple[set[str], set[str]]:
-    """Returns the variables that rows read before they assign them, and those that they assign."""
-    read, assigned = set[str](), set[str]()
-    for row in rows:
-        target, _, value = row.partition("=")
-        variable = target.strip()
-        is_assignment = _NAME.fullmatch(variable)  # Otherwise it is a result, or a condition.
-        read |= set(_NAME.findall(value if is_assignment else row)) - assigned
-        if is_assignment:
-            assigned.add(variable)
-    return read, assigned
+        text += "\n".join([head, *piece, "  return 0;", "}", "", ""])
+        calls += f"  if ({name}_{k}(arg, res, iw, w, a)) return 1;\n"
+    return f"{text}{function['head']}\n{calls}  return 0;\n}}"

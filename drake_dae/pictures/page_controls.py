@@ -9,9 +9,8 @@ from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
 from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import Signal, poles
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import GainError
 from drake_dae.systems.controller import SIGNAL, Controller
 from drake_dae.systems.plant import Plant
 from drake_dae.systems.references import CommandedReferences
@@ -150,25 +149,23 @@ def _surfaces(loop: ClosedLoop, numbers: Numbers, reach: float) -> list[Control]
 
 
 def _control_of_pole(controller: Controller, numbers: Numbers) -> list[Control]:
-    """A slider for the pole of all errors; none if the gains do not have a single pole."""
-    law, part = controller.law, numbers.systems.get(controller)
-    if not controller.follows or part is None:
+    """A slider that moves all poles of the errors in proportion: their mean."""
+    gains, part = controller.law.gains, numbers.systems.get(controller)
+    layout = gains.layout
+    if not controller.follows or part is None or not layout.chain_size:
         return []
-    size = law.system.parameter_symbol.numel()
-    try:
-        gains = {p: law.all_parameters(None, poles(-p))[size:] for p in (1.0, 2.0, 3.0)}
-    except GainError:
-        return []
-    factors, first = gains[1.0], part.start + size
-    indices = list(range(first, first + factors.size))
-    powers = np.round(np.log2(np.where(factors, gains[2.0] / np.where(factors, factors, 1.0), 1.0)))
-    if not indices or not np.allclose(factors * 3.0**powers, gains[3.0], rtol=1e-9):
-        return []
-    # The mean of all poles, since the computed eigenvalues of a multiple pole are not exact.
-    pole = -float(np.trace(law.gains.error_matrix)) / law.gains.layout.chain_size
-    if not np.allclose(numbers.values[indices], factors * pole**powers, rtol=1e-9):
-        return []
-    sets = tuple(indices), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
+    first = part.start + controller.law.system.parameter_symbol.numel()
+    starts = {int(i): int(layout.starts[i]) for i in layout.dynamic}
+    lengths = {i: end - starts[i] + 1 for i, end in zip(starts, layout.ends.tolist(), strict=True)}
+    # Of (30) in the time s t, the gain from derivative k to one of order n is s^(n - k) as large.
+    powers = [
+        lengths[i] - j + max(start for start in starts.values() if start <= j)
+        for j, i in np.argwhere(gains.matrix.T).tolist()
+    ]
+    places = range(first, first + len(powers))
+    pole = -float(np.trace(gains.error_matrix)) / layout.chain_size
+    factors = numbers.values[places] / pole ** np.array(powers)
+    sets = tuple(places), (), tuple(factors.tolist()), tuple(powers)
     fastest = rounded(max(4.0 * pole, 20.0))
     return [Control("pole", "pole of all errors", "1/s", -fastest, -0.5, -pole, *sets)]
 

@@ -438,7 +438,7 @@ class RunSummary:
 
 
 def _identified(record: Record, named: Collection[str]) -> Iterator[tuple[str, str]]:
-    """What an estimator found at the end that is new or that the user named, and how many more."""
+    """What an estimator found at the end that is new or that the user named."""
     if "identified" not in record.signals:
         if "friction" in record.signals:
             recorded = record.signals["friction"]
@@ -450,19 +450,12 @@ def _identified(record: Record, named: Collection[str]) -> Iterator[tuple[str, s
     # The first row has the deviations of values that are equally likely within their bounds.
     is_excited = own < UNEXCITED * deviations[0]
     is_named = np.array([s.name.partition("[")[0] in named for s in recorded.signals])
-    is_told = is_excited & (is_named | (np.abs(found - believed) > SURE * own))
-    for i in np.flatnonzero(is_told):
+    for i in np.flatnonzero(is_excited & (is_named | (np.abs(found - believed) > SURE * own))):
         signal = recorded.signals[i]
         yield "identified", f"{signal.name} = {found[i]:.3g} +- {own[i]:.1g} {signal.unit}".rstrip()
     if (is_named & ~is_excited).any():
         names = ", ".join(recorded.signals[i].name for i in np.flatnonzero(is_named & ~is_excited))
         yield "not identified", f"{names}: this motion does not excite them"
-    counts = (
-        (np.sum(is_excited & ~is_told), "more within two deviations of what the law believes"),
-        (np.sum(~is_excited & ~is_named), "more that this motion does not excite"),
-    )
-    if texts := [f"{count} {text}" for count, text in counts if count]:
-        yield "estimated", ", ".join(texts)
 
 
 def _named(values: dict[str, Any]) -> dict[str, Any]:

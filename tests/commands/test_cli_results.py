@@ -117,30 +117,3 @@ def test_it_leaves_its_files_and_tells_programs_and_people(tmp_path, monkeypatch
     said = capsys.readouterr().err
     assert "duration" in said
     assert "runs/two_link_wall-sweep/runs.db" in said
-
-
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        (["--vary", "start.errors.tool=0.1"], "start.errors: no output 'tool'"),
-        (["--vary", "start.error=0.1"], "start: has no key 'error'; did you mean 'errors'"),
-        (["--vary", "duration=1..2"], "duration: 1..2 needs the number of its values"),
-        (["--vary", "duration=1..2", "--random", "0"], "count must be a whole number from 1"),
-        (["--vary", "duration=1", "--workers", "0"], "workers must be a whole number from 1"),
-        (["--vary", "plant.parameters.a=1"], "plant.parameters: two_link_arm: no parameter 'a'"),
-    ],
-)
-def test_errors_are_reported_before_anything_runs(options, line, tmp_path, capsys):
-    folder = tmp_path / "out"
-    assert main(["sweep", "two_link_wall", *options, *SHORT, "--out", str(folder)]) == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("error: ")
-    assert line in said
-    assert not folder.exists()
-
-
-def test_the_files_of_others_are_left_alone(tmp_path, capsys):
-    (tmp_path / "runs.csv").write_text("mine")
-    assert main(["sweep", "two_link_wall", *VARY, *SHORT, "--out", str(tmp_path)]) == 1
-    assert "runs.csv" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["runs.csv"]
