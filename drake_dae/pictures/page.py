@@ -25,6 +25,7 @@ from drake_dae.blocks.compose import compose
 from drake_dae.dae import DaeSystem
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import MachineCodeError, ModelError
+from drake_dae.pictures.motion import surface_normals
 from drake_dae.pictures.page_controls import (
     Numbers,
     controls_of,
@@ -146,7 +147,7 @@ def as_script(data: Any) -> str:
         text = json.dumps(data, allow_nan=False)
     except ValueError:
         raise ModelError("a page needs finite numbers") from None
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    return text.replace("<", "\\u003c")
 
 
 class Bench:
@@ -258,11 +259,7 @@ class RobotScene:
         self.targets = [each for each in model.outputs if isinstance(each, PointCoordinates)]
 
     def columns(self, state: ca.SX, force: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Numbers in the world, as one column of expressions.
-
-        12 for each body, R by columns and p; points of application, forces and moments of
-        all constraints; 12 for each surface; the point of each target.
-        """
+        """Poses of bodies, R by columns and p; wrenches; poses of surfaces; targets: one column."""
         model, links = self.model, self.model.links
         symbols = [ca.vertcat(links.q, links.v), ca.SX.sym("force", model.dae.num_constraints)]
         symbols.append(model.dae.parameter_symbol)
@@ -282,6 +279,7 @@ class RobotScene:
     def data(self, state: FloatArray, slider: Callable[[str, str], int | None]) -> dict[str, Any]:
         """What the browser knows of these parts; `slider` gives the index of a slider."""
         model, acting = self.model, list(self.wrenches.constraints)
+        normals = surface_normals(model, self.wrenches, state, model.dae.parameter_values)
         names = [signal.name for signal in self.plant.dae.output_signals]
         constraints = [
             {
@@ -294,13 +292,13 @@ class RobotScene:
         surfaces = []
         for surface in self.surfaces:
             position = next(p for p in surface.parameters if p.name == f"{surface.name}.position")
-            direction = self._normal(surface, state).tolist() if surface in acting else None
+            normal = normals[acting.index(surface)] if surface in acting else np.zeros(3)
             surfaces.append(
                 {
                     "name": surface.name,
                     "path": _path(surface, "surface"),
                     "controls": [slider("surface", s.name) for s in position.signals],
-                    "direction": direction,
+                    "direction": normal.tolist() if normal.any() else None,
                 }
             )
         targets = []
@@ -315,22 +313,12 @@ class RobotScene:
                     "outputs": [[axis, names.index(name)] for axis, name in axes],
                 }
             )
-        bodies = [{"name": name, "path": path} for name, path, _ in self.bodies]
         return {
-            "bodies": bodies,
+            "bodies": [{"name": name, "path": path} for name, path, _ in self.bodies],
             "constraints": constraints,
             "surfaces": surfaces,
             "targets": targets,
         }
-
-    def _normal(self, surface: Constraint, state: FloatArray) -> FloatArray:
-        """The unit normal of a surface at its contact point: of the force at rest."""
-        model = self.model
-        rest = np.concatenate([state[: model.links.q.numel()], np.zeros(model.links.v.numel())])
-        multipliers = np.ones(sum(len(c.force_signals) for c in model.constraints))
-        row = list(self.wrenches.constraints).index(surface)
-        force = self.wrenches(rest, multipliers).forces[row]
-        return np.asarray(force / np.linalg.norm(force))
 
 
 def meshcat_page(robot: RobotScene, state: FloatArray, scene_graph: SceneGraph | None) -> str:

@@ -23,25 +23,19 @@ _ORDER = ("N", "m")  # The units of the first sliders of references; all others 
 
 @dataclass(frozen=True)
 class Control:
-    """A slider, or an object that a person drags, and the places of the parameters that it sets.
+    """A slider, or an object that a person drags, and the places of the parameters that it sets."""
 
-    Its kind is "reference", "surface", "signal", "plant" or "pole". `known` are the places of the
-    same parameters in the law's model, which it sets, too, if the person so chooses. One for poles
-    sets parameter i to `factors[i] * |value| ** powers[i]`. `rate` is the largest rate of change
-    per s, 0 for no limit.
-    """
-
-    kind: str
+    kind: str  # "reference", "surface", "signal", "plant" or "pole"
     label: str
     unit: str
     low: float
     high: float
     value: float
     inputs: tuple[int, ...]
-    known: tuple[int, ...] = ()
-    factors: tuple[float, ...] = ()
+    known: tuple[int, ...] = ()  # The same parameters of the law's model, if the person so chooses.
+    factors: tuple[float, ...] = ()  # Of poles: parameter i is factors[i] * |value| ** powers[i].
     powers: tuple[int, ...] = ()
-    rate: float = 0.0
+    rate: float = 0.0  # the largest rate of change per s; 0: no limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +44,8 @@ class Numbers:
 
     signals: Sequence[Signal]
     values: FloatArray
-    systems: Mapping[System, slice]
-    """System -> the place of its parameters."""
-    inputs: Mapping[str, slice]
-    """Name of a free input port -> the place of its value."""
+    systems: Mapping[System, slice]  # System -> the place of its parameters.
+    inputs: Mapping[str, slice]  # Name of a free input port -> the place of its value.
 
     def of(self, system: Any) -> dict[str, int]:
         """Name of a parameter of a block -> its place."""
@@ -122,11 +114,9 @@ def _commands(loop: ClosedLoop, numbers: Numbers, time: float, size: float) -> l
 
 
 def _surfaces(loop: ClosedLoop, numbers: Numbers, reach: float) -> list[Control]:
-    """Sliders for the positions of surfaces.
-
-    Those that move do so in the plant and in the law. Those of a compliant contact are parameters
-    of the plant and not of the law, and change in steps, which the limited rate makes small.
-    """
+    """Sliders for the positions of surfaces."""
+    # Those that move do so in the plant and in the law. Those of a compliant contact are parameters
+    # of the plant and not of the law, and change in steps, which the limited rate makes small.
     places, plant = dict[str, list[int]](), loop.plant
     for generator in dict.fromkeys((loop.plant_exogenous, loop.exogenous)):
         if isinstance(generator, CommandedReferences):
@@ -173,12 +163,9 @@ def _control_of_pole(controller: Controller, numbers: Numbers) -> list[Control]:
 def strongest_pushes(
     plant: Plant, state: FloatArray, links: Sequence[str], rate: float
 ) -> dict[str, float]:
-    """Link -> the force of the strongest push on it, in N.
-
-    A law with poles at -p acts on a mass m like a spring of stiffness m p^2, and the effective mass
-    at the link's origin, where it is smallest, is 1 / (J M^-1 J^T). So a force m p^2 d moves the
-    link by d; `rate` is p^2 d.
-    """
+    """Link -> the force of the strongest push on it, in N; `rate` is p^2 d."""
+    # A law with poles at -p acts on a mass m like a spring of stiffness m p^2, and the mass at the
+    # link's origin is 1 / (J M^-1 J^T). So a force m p^2 d moves the link by d.
     robot, forces = plant.robot("a page").links.plant, dict[str, float]()
     if robot is None:
         return forces

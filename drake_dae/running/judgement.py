@@ -72,20 +72,18 @@ class RunFinding:
 
 @dataclass(frozen=True)
 class OutputQuality:
-    """How well an output followed its reference: z - r, in its unit.
-
-    `off_prediction` is the largest deviation from the predicted error (30); `within_since` the time
-    in s from which |z - r| stayed within the tolerance, None if it was outside at the end.
-    """
+    """How well an output followed its reference: z - r, in its unit."""
 
     signal: Signal
     start: float
     largest: float
     final: float
     late_rms: float
-    off_prediction: float
+    off_prediction: float  # the largest deviation from the predicted error (30)
     tolerance: float
-    within_since: float | None
+    within_since: (
+        float | None
+    )  # in s, |z - r| stayed within the tolerance; None: outside at the end
 
 
 @dataclass(frozen=True)
@@ -110,10 +108,7 @@ class RunSummary:
     Without phases, each output must be within its tolerance from the first half of the run on, or
     from the time at which the predicted error is. If the predicted error exceeds the tolerance even
     at the end, and the run follows it, the run is undecided; so it is if it is off the prediction
-    for no known reason. With phases, the last one must end. `reasons` explain a deviation,
-    `accuracy` is that of error control, and `ended` why the run broke off. `remedies` are what to
-    look at beside the causes of the findings, `notes` what is approximate, and `named` the
-    parameters that the user had estimated; statistics are None for a failed run.
+    for no known reason. With phases, the last one must end.
     """
 
     record: Record
@@ -121,14 +116,14 @@ class RunSummary:
     ranges: Sequence[SignalRange] = ()
     tolerances: Mapping[str, float] = field(default_factory=dict)
     changes: Sequence[PhaseChange] = ()
-    ended: str = ""
-    accuracy: float | None = None
-    reasons: Sequence[str] = ()
+    ended: str = ""  # why the run broke off
+    accuracy: float | None = None  # of error control
+    reasons: Sequence[str] = ()  # of a deviation from the prediction
     more: Sequence[RunFinding] = ()
-    statistics: RunStatistics | None = None
-    remedies: Sequence[str] = ()
-    notes: Sequence[str] = ()
-    named: Collection[str] = ()
+    statistics: RunStatistics | None = None  # None for a failed run
+    remedies: Sequence[str] = ()  # what to look at beside the causes of the findings
+    notes: Sequence[str] = ()  # what is approximate
+    named: Collection[str] = ()  # the parameters that the user had estimated
 
     def __str__(self) -> str:
         reasons = [finding.text for finding in self.findings]
