@@ -348,14 +348,11 @@ class ScenarioTask:
     It starts at rest at start.positions, or in contact near them if the first phase requires
     contact. Without start.positions it starts 20 mm before the surface, with the first reference of
     each output. While the contact is open, its distance, such as "wall.distance", is an output in
-    place of its force, and so is each distance of several points. `plant` has a contact that opens,
-    such as `!CompliantContact`.
+    place of its force. `plant` has a contact that opens, such as `!CompliantContact`.
 
     Attributes:
         phases: The phases in their order; after the last one the robot rests.
         contact: The name of the constraint that opens and closes; not needed if there is only one.
-            Or the list of points that do so together, with as many `!ForceCombination`s of their
-            forces, one of them their sum.
         contact_force: The force in N below which the contact counts as open.
         patience: The time in s after which a contact without force counts as lost.
         tare_time: The time in s at the beginning for which a task without contact measures the bias
@@ -368,7 +365,7 @@ class ScenarioTask:
     """
 
     phases: Sequence[systems.Phase]
-    contact: str | Sequence[str] = ""
+    contact: str = ""
     contact_force: float = 0.5
     patience: float = 0.25
     tare_time: float = 0.0

@@ -160,32 +160,6 @@ def in_band(loop, record):
 
 
 @pytest.mark.slow
-def test_without_a_force_sensor_the_force_is_that_of_the_model():
-    """Below 0.1 mm and 0.5 N on a plant without model errors except its friction."""
-    points = ", ".join(f"tool.{axis}: [15625.0, 1250.0, 50.0]" for axis in "yz")
-    names = ("tool.z_axis.y", "tool.z_axis.z", "joint3", "joint7")
-    others = ", ".join(f"{name}: [625.0, 35.4]" for name in names)
-    loop, record = roll(
-        scenario(
-            "wall_point_contact",
-            "plant=!CompliantContact {time_step: 0.001, friction: 0.3}",
-            "sensors.encoders={resolution: 1.0e-5}",
-            f"law.gains=!Coefficients {{outputs: {{{points}, {others}}}}}",
-            "law.integral=[tool.y, tool.z]",
-            "estimator={rate: 33, friction_rate: 8, state_rate: 333, parameters: [wall.friction]}",
-            "duration=4",
-        )
-    )
-    assert not loop.controller.law.measured_force
-    late = record.time > 2.0
-    error = record["tracking_error"][late]
-    assert np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1))) < 1e-4
-    assert np.sqrt(np.mean(error[:, -1] ** 2)) < 0.5
-    missed = record["estimated_force"][late] - record["constraint_force"][late]
-    assert np.sqrt(np.mean(missed**2)) < 0.5
-
-
-@pytest.mark.slow
 def test_the_first_break_away_of_encoders_alone_does_not_swing():
     """At most 0.1 mm and 0.3 N, at a friction of 0.45 that the law takes for 0; 0.97 mm without.
 
