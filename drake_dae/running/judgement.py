@@ -10,7 +10,7 @@ from functools import cached_property
 from math import isfinite
 from signal import Signals
 from textwrap import fill
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -215,20 +215,14 @@ class RunSummary:
         forced = (r for r in self.ranges if r.kind is LimitKind.FORCE)
         pushing = {r.signal.name for r in forced if r.low == 0.0}
         for signal, values in zip(forces.signals, forces.values.T, strict=True):
-            touches, decides = np.flatnonzero(values > 0.0), cast(Outcome | None, Outcome.BAD)
-            is_other = not touches.size and (values.size < 2 or values.any())
-            if signal.name not in pushing or is_other:
+            touched = int(np.argmax(values > 0.0))  # 0 if it never is.
+            lost = touched + np.flatnonzero(values[touched:-1] == 0.0)
+            if signal.name not in pushing or not lost.size:
                 continue
-            if not touches.size:
-                text, first = f"{signal.name} is 0 all the time", times[0]
-            else:
-                lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
-                if not lost.size:
-                    continue
-                first, lasted = times[lost[0]], np.diff(times)[lost].sum()
-                text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
-                if times[lost[-1]] < 0.5 * (times[0] + times[-1]):
-                    decides = None
+            first, lasted = times[lost[0]], np.diff(times)[lost].sum()
+            text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
+            is_late = times[lost[-1]] >= 0.5 * (times[0] + times[-1])
+            decides = Outcome.BAD if is_late else None
             yield RunFinding(FindingKind.CONTACT, text, decides, signal, 0.0, time=float(first))
 
     def _of_outputs(self) -> Iterator[RunFinding]:
