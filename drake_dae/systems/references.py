@@ -60,7 +60,7 @@ def reference_block(references: Sequence[Reference], degrees: Sequence[int]) -> 
         raise ReferenceSignalError(
             f"the references cover {covered} outputs, the law has {len(degrees)}"
         )
-    wholes = map(_whole, references)
+    wholes = (r.reference if isinstance(r, ReferenceRows) else r for r in references)
     ranges = (each.range for each in wholes if isinstance(each, TrajectoryReference))
     outputs = {"reference": traced_references(references, degrees, TIME)}
     return Block("reference", outputs=outputs, requirements=tuple(ranges))
@@ -75,17 +75,12 @@ def traced_references(
         row = reference.expression(its_degrees, time)
         if row is None:
             raise ReferenceSignalError(
-                f"a {type(_whole(reference)).__name__} is no expression of time: define its "
+                f"a {type(reference).__name__} is no expression of time: define its "
                 "`expression`, or take an ExpressionReference, or wire a system of your own to the "
                 "controller's port 'reference'"
             )
         rows.append(row)
     return ca.vertcat(*rows)
-
-
-def _whole(reference: Reference) -> Reference:
-    """The reference of which this one may be some rows."""
-    return reference.reference if isinstance(reference, ReferenceRows) else reference
 
 
 @checked(ReferenceSignalError)
