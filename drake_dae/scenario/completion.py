@@ -16,6 +16,7 @@ from drake_dae.errors import ReferenceSignalError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.by_name import denoted
 from drake_dae.robots import (
+    LETTERS,
     AxisCoordinates,
     Constraint,
     ConstraintSet,
@@ -142,7 +143,7 @@ class _Search:
                     rows |= zip(letters, self._add(point, "axes"), strict=True)
             self._points.append([rows[axis] for axis in "xyz"])
             column, sign = tool_axis(links, touch)
-            axis = "xyz"[column]
+            axis = LETTERS[column]
             self._outward.append(sign * links.rotation(touch.frame)[:, column])
             if kind != "free":
                 tilt = TiltFromNormalForm(name, axis, "xyz".replace(axis, ""))
@@ -418,13 +419,12 @@ class _Search:
         scenario = self._scenario
         assert scenario.task is not None
         contact = scenario.task.contact
-        names = [contact] if isinstance(contact, str) else [*contact]
         values = {p.name: p.value for p in self._bound.parameters}
         values |= {name: np.atleast_1d(v) for name, v in scenario.plant.parameters.items()}
         moved = {
             f"{name}.position": values[f"{name}.position"] + BEFORE * normal
             for name, normal in zip(self._touches, touching.normals, strict=True)
-            if f"{name}.position" in values and (name in names or names == [""])
+            if f"{name}.position" in values and contact in (name, "")
         }
         q = self._postures(moved).solve(held, touching.rows[list(held)], touching.q)
         if q is None or not moved:

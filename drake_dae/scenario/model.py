@@ -150,7 +150,7 @@ def _checked_constraints(
             bound.place(force)
     each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
     with at("law.control_weights"):
-        choice = robots.control_choice(robot.title, scenario.law.control_weights or None, actuators)
+        choice = robots.control_choice(scenario.law.control_weights or None, actuators)
     parts: tuple[Any, ...] = (links, *constraints, *robot.known_forces, *attached)
     parameters = [p.name for p in (*choice, *(p for part in parts for p in part.parameters))]
     for moving in scenario.exogenous:
@@ -253,11 +253,11 @@ def reference_and_start(
     names = [signal.name for signal in model.dae.output_signals]
     degrees = structure.layout.reference_degrees
     stacked = stack_references(references_of(scenario, names, degrees), degrees)
-    outputs = stacked(scenario.integrator.start_time).copy()[structure.layout.lowest]
+    outputs = stacked(scenario.integrator.start_time)[structure.layout.lowest]
     parameters = model.dae.parameter_values
     with at("start"):
         start = start_state(scenario, model, outputs, parameters, parameters)
-    return lambda time: stacked(time).copy(), start
+    return stacked, start
 
 
 def motion_along(

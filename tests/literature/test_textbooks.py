@@ -3,35 +3,11 @@
 The sources were read where they are published on the web; each test names its own.
 """
 
-import casadi as ca
 import numpy as np
 from arms import error_controlled
 from numpy.testing import assert_allclose
 
-from drake_dae import DaePlant, DaeSystem, LinkExpressions, RobotModel, RobotPlant, simulate
-from drake_dae.robots import Blade
-
-G = 9.81
-NOTHING = np.zeros((3, 0))
-
-
-def flat(mass, about_center, center=0.0, gravity=G):
-    """A body in the x-z plane: its origin, and the angle of its x axis above the horizontal.
-
-    Its center of mass is on its x axis.
-    """
-    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
-    c, s = ca.cos(q[2]), ca.sin(q[2])
-    turned = ca.vertcat(ca.horzcat(c, 0, -s), ca.horzcat(0, 1, 0), ca.horzcat(s, 0, c))
-    lever = mass * center
-    M = ca.blockcat(
-        [[mass, 0, -lever * s], [0, mass, lever * c],
-         [-lever * s, lever * c, about_center + mass * center**2]]
-    )  # fmt: skip
-    spun = -lever * v[2] ** 2
-    H = ca.vertcat(spun * c, spun * s + mass * gravity, lever * gravity * c)
-    links = {"body": (turned, ca.vertcat(q[0], 0, q[1]))}
-    return LinkExpressions(q, v, M, H, links, actuation_matrix=NOTHING)
+from drake_dae import DaePlant, DaeSystem, simulate
 
 
 def test_a_ball_on_a_turntable_goes_round_with_two_sevenths_of_its_rate():
@@ -67,31 +43,3 @@ def test_a_ball_on_a_turntable_goes_round_with_two_sevenths_of_its_rate():
         assert_allclose(plant.state(context)[:2], wanted, atol=1e-9)
     force = plant.GetOutputPort("constraint_force").Eval(context)
     assert_allclose(force, mass * rate * np.array([-speed[1], speed[0]]), atol=1e-9)
-
-
-def test_chaplygins_sleigh_comes_out_of_its_turn_as_a_hyperbolic_tangent():
-    """v' = a w^2, w' = -m a / (I + m a^2) v w: v = c tanh(a c t / k^2), k^2 = (I + m a^2) / m.
-
-    Bloch, Nonholonomic Mechanics and Control, 1.7, as quoted at Mathematica Stack Exchange 162070.
-    With c^2 = v^2 + k^2 w^2, which is the energy, v' = a (c^2 - v^2) / k^2.
-    """
-    mass, about, ahead, spin = 2.0, 0.3, 0.4, 2.5
-    # The plane x-z lies on the ice, where there is no weight.
-    blade = Blade("body", (0, 0, 1))
-    links = flat(mass, about, ahead, gravity=0.0)
-    model = RobotModel(links, [blade], [], [0, 0, 0], "sleigh", forces=[])
-    plant = RobotPlant(model)
-    assert plant.structure.constraint_degrees == (1,)
-    context = plant.CreateDefaultContext()
-    plant.set_state(context, [0, 0, 0, 0, 0, spin])
-    simulate(plant, context, 1.5, error_controlled(1e-12))
-    gyration = (about + mass * ahead**2) / mass
-    energy = np.sqrt(gyration) * spin
-    way = ahead * energy * 1.5 / gyration
-    *_, angle, vx, vz, rate = plant.state(context)
-    assert_allclose(vx * np.cos(angle) + vz * np.sin(angle), energy * np.tanh(way), atol=1e-10)
-    assert_allclose(rate, spin / np.cosh(way), atol=1e-10)
-    # The blade bears m (v w + a w') across.
-    force = plant.GetOutputPort("constraint_force").Eval(context)
-    speed, slowing = energy * np.tanh(way), -ahead / gyration * energy * np.tanh(way) * rate
-    assert_allclose(force, mass * (speed * rate + ahead * slowing), atol=1e-9)

@@ -49,7 +49,6 @@ class Closure:
     - "plane": point B is in the plane through A with the normal `direction`, fixed in the world,
       with Coulomb's `friction` while it slides; the force with its friction. The plane may move
       along its normal, with `road`: its velocity and acceleration at the stated time.
-    - "ball": a ball of the radius `size` with the center B rolls on that plane; the force.
     - "gear": the position of `body_b` is `size` times that of `body_a` (one joint each); the moment
       on body B, which gives `size` times the opposite on A.
     """
@@ -85,10 +84,8 @@ class Mechanism:
 
     Each body stands after its parent. Of `q` the positions of `free` joints are exact, the others
     guesses from which Newton's method starts; `v` has the rates of free joints that are not zero.
-    The rates of the free joints determine all rates; those `placed` determine all positions, and
-    are more than the free ones if the constraint is nonholonomic. `torques` act in joints. If
-    forces are redundant, `split` says how they are split. After `duration`, if it is not zero, the
-    forces are compared again.
+    The free joints determine all others. `torques` act in joints. If forces are redundant, `split`
+    says how they are split. After `duration`, if it is not zero, the forces are compared again.
     """
 
     name: str
@@ -97,7 +94,6 @@ class Mechanism:
     q: tuple[float, ...]
     free: tuple[int, ...]
     v: Mapping[int, float] = field(default_factory=dict)
-    placed: tuple[int, ...] | None = None
     gravity: Vector = (0.0, 0.0, -9.81)
     torques: Mapping[int, float] = field(default_factory=dict)
     springs: tuple[Spring, ...] = ()
@@ -124,7 +120,6 @@ def force_names(closure: Closure) -> list[str]:
         "hinge": moment + force,
         "distance": ["thrust"],
         "plane": force,
-        "ball": force,
         "gear": ["moment"],
     }
     return [f"{closure.name}.{name}" for name in kinds[closure.kind]]

@@ -17,8 +17,6 @@ HARD = 'solimp="0.9999 0.9999 0.001 0.5 2" solref="-1e-9 -1e-9"'
 mujoco.set_mju_user_warning(lambda message: None)
 
 RADIUS = 0.01
-GRIP = 10.0
-"""The friction of a ball that must not slip."""
 
 SLIDING = 'solreffriction="-1e-9 -15"'
 """Friction that reaches its cone; more would make the normal force larger."""
@@ -106,7 +104,7 @@ def solved(
 
 def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, list[str]]:
     """A plane for each contact, and a ball on the body that touches it at the point."""
-    touching = [c for c in mechanism.closures if c.kind in ("plane", "ball")]
+    touching = [c for c in mechanism.closures if c.kind == "plane"]
     geoms: dict[str, list[str]] = {}
     if not touching:
         return geoms
@@ -114,10 +112,7 @@ def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[st
     for closure in touching:
         normal = np.array(closure.direction)
         rotation = data.xmat[model.body(closure.body_b).id].reshape(3, 3)
-        ball = closure.kind == "ball"
-        radius = closure.size if ball else RADIUS
-        center = np.array(closure.point_b) + (0 if ball else RADIUS * rotation.T @ normal)
-        friction = GRIP if ball else closure.friction
+        center, friction = closure.point_b + RADIUS * rotation.T @ normal, closure.friction
         plane, sphere = (f'name="{closure.name}_{end}" contype="0" conaffinity="0"'
                          for end in ("plane", "ball"))  # fmt: skip
         geoms.setdefault("world", []).append(
@@ -125,7 +120,7 @@ def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[st
             f'zaxis="{numbers(normal)}"/>'
         )
         geoms.setdefault(closure.body_b, []).append(
-            f'<geom {sphere} type="sphere" size="{radius}" pos="{numbers(center)}" mass="0"/>'
+            f'<geom {sphere} type="sphere" size="{RADIUS}" pos="{numbers(center)}" mass="0"/>'
         )
         geoms.setdefault("pairs", []).append(
             f'<pair geom1="{closure.name}_plane" geom2="{closure.name}_ball" margin="0.001" '
@@ -153,7 +148,7 @@ def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.n
     model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v))
     found = {}
     for closure in mechanism.closures:
-        if closure.kind in ("plane", "ball"):
+        if closure.kind == "plane":
             found[closure.name] = contact_force(model, data, closure)
             continue
         number = model.equality(closure.name).id
@@ -183,8 +178,6 @@ def moment(
 def contact_force(model: mujoco.MjModel, data: mujoco.MjData, closure: Closure) -> np.ndarray:
     """The force of a contact on the body, in the world."""
     target = data.site(f"{closure.name}_b").xpos
-    if closure.kind == "ball":
-        target = target - closure.size * np.array(closure.direction)
     if not data.ncon:
         raise NotImplementedError("the contact opened")
     near = min(range(data.ncon), key=lambda i: np.linalg.norm(data.contact[i].pos - target))

@@ -7,7 +7,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.robots import RollingBall
 from referee.description import Closure, Mechanism
 from referee.tree import add_tree, controls, frame_at
 
@@ -57,8 +56,6 @@ def constraint(mechanism: Mechanism, closure: Closure) -> object:
         )
         return dd.JointCoupler(follower, leader, closure.size, name=name)
     plane = dd.Plane(closure.point_a, closure.direction)
-    if closure.kind == "ball":
-        return RollingBall(b, plane, closure.size, name=name)
     friction = closure.friction or None
     return dd.PointOnSurface(b, plane, name=name, friction=friction, stiction_tolerance=STILL)
 

@@ -18,7 +18,6 @@ REFUSED = {
     "gear": "no gear among its constraints",
     "plane": "its points are fixed in all directions; contacts that slide are solved for rates, "
     "after a step of time",
-    "ball": "no rolling among its constraints",
 }
 
 
