@@ -14,8 +14,8 @@ from runs import scenario_model
 from vendors import joint, link, panda, robot, write_panda
 
 from drake_dae import load_scenario
-from drake_dae.errors import RobotFileWarning, ScenarioError
-from drake_dae.scenario.robot_file.reading import finalize, read_robot, robot_links
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.robot_file.reading import finalize, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
 # The collision meshes of the panda are left out.
@@ -185,32 +185,7 @@ def test_a_joint_that_follows_with_multiplier_0_stands(tmp_path):
     bodies = [link(name, 1) for name in ("base", "arm", "hand")]
     (tmp_path / "arm.urdf").write_text(robot("arm", *bodies, *joints))
     (tmp_path / "arm.yaml").write_text(FRICTION)
-    with pytest.warns(RobotFileWarning, match="'k'"):
-        links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
+    links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
     assert [signal.name for signal in links.position_signals] == ["j"]
     weld = links.plant.GetJointByName("k").X_FM()
     np.testing.assert_allclose(RollPitchYaw(weld.rotation()).vector(), [0, 0.3, 0], atol=1e-15)
-
-
-MASS = "<inertial><mass>1</mass></inertial>"
-TURNS = (
-    '<joint name="{}" type="revolute"><parent>{}</parent><child>{}</child>{}<axis><xyz>0 1 0</xyz>'
-)
-TURNS += "</axis></joint>"
-OPEN = f"""<sdf version="1.9"><model name="m"><link name="a">{MASS}</link>
-<link name="b"><pose>0 0 1 0 0 0</pose>{MASS}</link><link name="c"><pose>1 0 0 0 0 0</pose>{MASS}
-</link><frame name="tip" attached_to="a"><pose>1.28 0 0 0 0 0</pose></frame>
-<joint name="hold" type="fixed"><parent>world</parent><child>a</child></joint>
-{TURNS.format("one", "a", "b", "")}{TURNS.format("two", "b", "c", "")}
-{TURNS.format("three", "tip", "c", "POSE")}</model></sdf>"""
-
-
-def test_a_loop_whose_named_parent_frame_is_elsewhere_is_told(tmp_path):
-    """SDFormat puts a joint at its child, and takes only the body of a frame that is its parent."""
-    file = tmp_path / "loop.sdf"
-    file.write_text(OPEN.replace("POSE", ""))
-    with pytest.raises(ScenarioError, match=r"'three'.* 0\.28 m .*'tip'"):
-        robot_links(Robot(str(file)), SceneGraph())
-    file.write_text(OPEN.replace("POSE", "<pose relative_to='tip'/>"))
-    _, (loop,) = robot_links(Robot(str(file)), SceneGraph())
-    assert loop.name == "three"
