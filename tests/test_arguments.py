@@ -21,28 +21,16 @@ import numpy as np
 import pytest
 from arms import arm, fixed_step, law
 from numpy.typing import ArrayLike, NDArray
-from polishing import laws, task_loop
+from polishing import laws
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.symbolic import Variable
 from pydrake.systems.framework import Context, Diagram, System
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 import drake_dae as dd
-from drake_dae.analysis import Analysis, Assumption
 from drake_dae.arguments import checked, uncollected
 from drake_dae.blocks.block import Block
-from drake_dae.dae import (
-    Derivatives,
-    Elimination,
-    FeedbackGains,
-    Manifold,
-    PinnedMotion,
-    RankMargin,
-    SensedContact,
-    SensorNoise,
-    with_disturbance,
-)
+from drake_dae.dae import FeedbackGains, with_disturbance
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.references import PathLimits
@@ -62,19 +50,13 @@ def loop() -> dd.ClosedLoop:
 
 
 def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    robot = scenario().robot
-    read_robot(robot, plant, scene_graph)
+    read_robot(scenario().robot, plant, scene_graph)
 
 
 @cache
 def observed_law() -> dd.TrackingLaw:
     dae = with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
     return dd.TrackingLaw(dae, dd.poles(-4.0))
-
-
-def sensed() -> SensedContact:
-    noise = SensorNoise(1e-5, force=0.1)
-    return SensedContact(1e-3, 1, 1e5, 0.03, 0.3, 0.7, 0.7, 5.0, noise, True)
 
 
 @cache
@@ -85,56 +67,18 @@ def record() -> dd.Record:
 
 
 @cache
-def task() -> dd.ClosedLoop:
-    return task_loop([dd.Approach(), dd.Press(20.0)])
-
-
-def context_of(owner: Any) -> Context:
-    return (owner if isinstance(owner, System) else loop().diagram).CreateDefaultContext()
-
-
-def state() -> np.ndarray:
-    return arm("two_link").structure.states[0]
-
-
-def normal_form() -> dd.NormalForm:
-    return _normal_form()
-
-
-@cache
-def _normal_form() -> dd.NormalForm:
-    return dd.NormalForm(arm("two_link").model.dae, structure=arm("two_link").structure)
-
-
-@cache
-def analysis() -> Analysis:
-    return dd.analyze(arm("two_link").model.dae, count=3)
-
-
-@cache
-def pinned_motion() -> PinnedMotion:
-    dynamics = dd.ZeroDynamics(arm("two_link").model.dae, structure=arm("two_link").structure)
-    return dynamics.motion(lambda t: record()["reference"][0], [0.0, 0.1])
-
-
-@cache
 def scenario() -> Scenario:
     return dd.load_scenario(find_scenario("two_link_wall"))
 
 
 # A value of each type that is fine where nothing else is said.
 SAMPLES: dict[Any, Callable[[], Any]] = {
-    Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,
-    bool: lambda: False,
     float: lambda: 0.5,
-    int: lambda: 1,
     str: lambda: "tool",
     ca.SX: lambda: ca.SX.sym("p", 3),
     Block: lambda: loop().plant.block,
-    Assumption: lambda: SAMPLES[Analysis]().assumptions[0],
     Diagram: lambda: loop().diagram,
-    Analysis: analysis,
     dd.ClosedLoop: loop,
     dd.ContactMaterial: dd.ContactMaterial,
     PointMaterial: PointMaterial,
@@ -142,16 +86,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Plant: lambda: loop().plant,
     dd.DaeSystem: lambda: arm("two_link").model.dae,
     FeedbackGains: lambda: law("two_link").gains,
-    dd.Sampling: lambda: dd.Sampling(0.01),
-    dd.Encoders: lambda: dd.Encoders(1e-5),
-    Observing: lambda: Observing(10.0),
-    SensedContact: sensed,
-    SensorNoise: lambda: SensorNoise(),
-    dd.NormalForm: normal_form,
-    Manifold: lambda: arm("two_link").structure.manifold,
-    Derivatives: lambda: arm("two_link").structure.derivatives,
-    Elimination: lambda: arm("two_link").structure.elimination,
-    RankMargin: lambda: arm("two_link").structure.control_margin,
     PathLimits: lambda: PathLimits(0.2, 1.0),
     dd.Record: record,
     dd.ReferenceGenerator: lambda: loop().reference,
@@ -159,21 +93,17 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Signal: lambda: dd.Signal("a"),
     dd.TrackingLaw: lambda: law("two_link"),
     Constraint: lambda: arm("two_link").model.constraints[0],
-    Context: lambda: context_of(None),
+    Context: lambda: loop().diagram.CreateDefaultContext(),
     Links: lambda: arm("two_link").model.links,
-    MultibodyPlant: lambda: arm("two_link").plant,
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
     Scenario: scenario,
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
     System: lambda: loop().diagram,
-    Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
 }
 
 # What fits an argument with a name, of all names or of one.
 PLACES: dict[str, Callable[[], Any]] = {
-    "states": lambda: state()[None],
     "times": lambda: [0.0, 0.1],
-    "reference": lambda: record()["reference"][0],
     "add_robot": lambda: add_arm,
     "limits of ControlLimits": lambda: [1.0],
     "axis": lambda: (0.0, 0.0, 1.0),
@@ -186,25 +116,17 @@ PLACES: dict[str, Callable[[], Any]] = {
     "observing of StateEstimator": lambda: Observing(10.0, state_rate=40.0),
     "center": lambda: (0.0, 0.0, 0.0),
     "degrees": lambda: [2],
-    "outputs": lambda: [0.3, 10.0],
     "plant of make_closed_loop": lambda: dd.RobotPlant(
         arm("two_link").model, structure=arm("two_link").structure
     ),
     "phases": lambda: [dd.Approach()],
     "references of Move": lambda: {"tool.z": 0.3},
     "force of Press": lambda: 20.0,
-    "of": lambda: "force",
     "task": lambda: dd.Task([dd.Approach()]),
     "law of TaskController": lambda: laws()[0],
     "free_law": lambda: laws()[1],
-    "controller of wire_loop": lambda: dd.TaskController(
-        dd.Task([dd.Approach()]), laws()[0], laws()[1], sample_period=1e-3
-    ),
-    "integrators": lambda: {"joint1_motor": 1},
-    "count": lambda: 3,
     "structure": lambda: arm("two_link").structure,
     "name": lambda: "name",
-    "time": lambda: ca.SX.sym("t"),
     "values": lambda: -1.0,
     "state of DaeSystem": lambda: ca.SX.sym("x", 1),
     "state of from_symbolic": lambda: [Variable("x")],
@@ -212,28 +134,22 @@ PLACES: dict[str, Callable[[], Any]] = {
     "outputs of ExpressionOutput": lambda: [dd.Signal("a")],
     "second": lambda: "other",
     "follower": lambda: "joint1",
-    "matrix": lambda: [[4.0, 4.0]],
     "end_time": lambda: 1.0,
     "time of Record": lambda: [0.0, 1.0],
     "references": lambda: [dd.ConstantReference([0.3, 10.0])],
     "references of ReferenceGenerator": lambda: [dd.ConstantReference(0.3)],
     "points of PolylineReference": lambda: [[0.0], [1.0]],
     "points of WaypointsReference": lambda: [[0.0], [1.0]],
-    "file of CsvReference": lambda: str(
-        Path(__file__).parent / "systems" / "control" / "steps.csv"
-    ),
+    "file of CsvReference": lambda: str(Path(__file__).parent / "systems" / "steps.csv"),
     "columns of CsvReference": lambda: ["x"],
     "q": lambda: ca.SX.sym("q"),
     "v": lambda: ca.SX.sym("v"),
     "mass_matrix": lambda: ca.SX(2.0),
     "bias": lambda: ca.SX(0.0),
     "path": lambda: find_scenario("two_link_wall"),
-    "size of MeasuredSurface": lambda: (0.4, 0.3),
-    "heights": lambda: [[0.0, 0.1], [0.0, 0.2]],
     "file": lambda: None,
     "log": lambda: loop().log,
-    "groups": lambda: [np.eye(1), np.eye(1)],
-    "starts": state,
+    "starts": lambda: arm("two_link").structure.states[0],
     "parameters of rollout": lambda: None,
 }
 

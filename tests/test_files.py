@@ -1,10 +1,7 @@
 """Files that a user names: what is none, or holds what it should not, is refused in a sentence."""
 
-import io
-import json
 import os
 import signal
-import struct
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -14,7 +11,6 @@ import pytest
 from runs import scenario
 
 from drake_dae import CsvReference, MeasuredSurface, Record, load_scenario, new_scenario
-from drake_dae.dae import Signal
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.files import read_bytes, read_text
 from drake_dae.scenario.robot_file.reading import read_robot
@@ -76,34 +72,6 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path):
 # Heights.
 
 
-def npy(array, **options):
-    file = io.BytesIO()
-    np.save(file, array, **options)
-    return file.getvalue()
-
-
-def header(text):
-    """An .npy file of a header alone."""
-    data = text.encode().ljust(117) + b"\n"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(data)) + data
-
-
-def zipped():
-    file = io.BytesIO()
-    np.savez(file, a=np.eye(3))
-    return file.getvalue()
-
-
-def member(name, data):
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(name, data)
-    return file.getvalue()
-
-
-CLAIMS = "{{'descr': '<f8', 'fortran_order': False, 'shape': {}, }}".format
-
-
 @pytest.mark.parametrize(
     ("name", "data"),
     [
@@ -117,7 +85,6 @@ CLAIMS = "{{'descr': '<f8', 'fortran_order': False, 'shape': {}, }}".format
                 "1e308,2\n3,-1e308\n",
             )
         ),
-        ("a.npy", npy(np.eye(3))),
         ("a.xyz", b"1 2 3\n4 5 6\n"),
     ],
 )
@@ -164,17 +131,7 @@ def test_a_mesh_with_wrong_vertices_is_refused(text, tmp_path):
         MeasuredSurface(file=tmp_path / "a.obj")
 
 
-@pytest.mark.parametrize("faces", ["f 1 2 4 3", "f -4 -3 -1\nf 1 4 3", "f 1/1 2/2 4/3\nf 1//1 4 3"])
-def test_each_way_to_write_faces_is_read(faces, tmp_path):
-    (tmp_path / "a.obj").write_text(f"{SQUARE}{faces}\n")
-    assert MeasuredSurface(file=tmp_path / "a.obj").fit.largest < 1e-9
-
-
 # Records.
-
-
-def deep(count=100_000):
-    return "[" * count + "]" * count
 
 
 def test_a_record_that_unpacks_to_gigabytes_is_refused_before_it_is_read(tmp_path):
@@ -191,37 +148,7 @@ def test_a_record_that_unpacks_to_gigabytes_is_refused_before_it_is_read(tmp_pat
     tracemalloc.stop()
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        f'{{"signals": {deep()}}}\n'.encode(),
-        b'{"signals": {"state": [[1]]}}\n' + bytes(7),
-        member("time.npy", header(CLAIMS("(1000000, 1000000)"))),
-        member("time.npy", npy(np.arange(3.0))[:-4]),
-        zipped()[:-20],
-    ],
-)
-def test_what_is_no_record_is_refused(data, tmp_path):
-    (tmp_path / "record.npz").write_bytes(data)
-    with pytest.raises(ModelError, match=r"record\.npz"):
-        Record.load(tmp_path / "record.npz")
-
-
 # Robots.
-
-INERTIA = """<sdf version="1.9"><model name="m"><link name="base"/>
-<link name="arm"><inertial><mass>{}</mass><inertia><ixx>{}</ixx><iyy>1</iyy><izz>1</izz></inertia>
-</inertial></link>
-<joint name="j" type="revolute"><parent>base</parent><child>arm</child><axis><xyz>0 0 1</xyz></axis>
-</joint></model></sdf>"""
-
-
-@pytest.mark.parametrize(("mass", "moment"), [("1", "9"), ("1", "nan"), ("-1", "1")])
-def test_an_inertia_of_no_body_in_sdformat_is_reported_by_its_link(mass, moment, tmp_path):
-    (tmp_path / "arm.sdf").write_text(INERTIA.format(mass, moment))
-    with pytest.raises(ModelError, match="'arm'"):
-        read_robot(Robot(file=str(tmp_path / "arm.sdf")))
-
 
 MJCF = "<mujoco>{}<worldbody><body name='b'><joint/><geom size='1'/></body></worldbody></mujoco>"
 SDF = (
@@ -235,13 +162,11 @@ ADD = "directives:\n- add_directives: {{file: 'package://mine/{}'}}\n".format
 @pytest.mark.parametrize(
     ("files", "chain"),
     [
-        ({"a.xml": MJCF.format(INCLUDE("a.xml"))}, "a.xml -> a.xml"),
         (
             {"a.xml": MJCF.format(INCLUDE("b.xml")), "b.xml": MJCF.format(INCLUDE("a.xml"))},
             "a.xml -> b.xml -> a.xml",
         ),
         ({"a.sdf": SDF.format("package://mine/a.sdf")}, "a.sdf -> a.sdf"),
-        ({"a.dmd.yaml": ADD("a.dmd.yaml")}, "a.dmd.yaml -> a.dmd.yaml"),
         (
             {"a.dmd.yaml": ADD("b.dmd.yaml"), "b.dmd.yaml": ADD("a.dmd.yaml")},
             "a.dmd.yaml -> b.dmd.yaml -> a.dmd.yaml",
@@ -277,16 +202,6 @@ def test_a_robot_that_includes_itself_is_refused(files, chain, tmp_path):
 def test_a_name_that_no_file_can_hold_is_refused(setting):
     with pytest.raises(ScenarioError, match=r"\\ud"):
         scenario("two_link_wall", setting)
-
-
-def test_a_signal_has_a_name_that_a_record_can_hold(tmp_path):
-    with pytest.raises(ModelError, match=r"'\\ud800'"):
-        Signal("\ud800")
-    name = "\u00fc \U0001f916"
-    record = Record(np.arange(2.0), {})
-    record.save(tmp_path / "record.npz")
-    assert Signal(name).derivative(1).name == f"{name}'"
-    assert json.dumps(Record.load(tmp_path / "record.npz").about)
 
 
 def test_the_length_of_a_path_does_not_matter(tmp_path):

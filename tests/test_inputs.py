@@ -1,14 +1,12 @@
 """Inputs that were accepted, hung or ended in exceptions of others: each refused, with words."""
 
-import logging
 import os
 
 import numpy as np
 import pytest
 from arms import arm, fixed_step
-from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import SimulatorConfig
-from runs import scenario, scenario_model
+from runs import scenario
 
 from drake_dae import (
     ConstantReference,
@@ -29,7 +27,6 @@ from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
 from drake_dae.running import export_loop, start_values
 from drake_dae.scenario.form import load_yaml
-from drake_dae.scenario.robot_file.robot import Robot
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
@@ -97,89 +94,6 @@ def test_paths_that_are_none(tmp_path, monkeypatch):
             load_scenario("scenario.yaml")
 
 
-URDF = """<robot name="r">
-<link name="arm"><inertial>{origin}{mass}
-{inertia}</inertial></link>
-<joint name="j" type="{type}">
-<parent link="world"/><child link="arm"/>{axis}
-{dynamics}
-<limit effort="{effort}"/></joint>
-<transmission name="t"><type>transmission_interface/SimpleTransmission</type>
-<joint name="{driven}"/><actuator name="m">{gear}</actuator></transmission>{more}
-</robot>{after}"""
-FINE = {
-    "origin": "",
-    "mass": '<mass value="1"/>',
-    "inertia": '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>',
-    "type": "continuous",
-    "axis": '<axis xyz="0 0 1"/>',
-    "dynamics": '<dynamics damping="0.1"/>',
-    "effort": "10",
-    "driven": "j",
-    "gear": "",
-    "more": "",
-    "after": "",
-}
-SECOND = """<transmission name="t2"><type>transmission_interface/SimpleTransmission</type>
-<joint name="j"/><actuator name="m2"/></transmission>"""
-
-ROBOTS = {
-    "a mass below zero": ({"mass": '<mass value="-6"/>'}, "'arm'.*-6 kg"),
-    "no mass": ({"mass": '<mass value="0"/>'}, "'arm'"),
-    "a mass left out": ({"mass": ""}, "'arm'"),
-    "an impossible inertia": (
-        {"inertia": '<inertia ixx="1" iyy="1" izz="5" ixy="0" ixz="0" iyz="0"/>'},
-        "'arm'",
-    ),
-    "no inertia at all": ({"mass": "", "inertia": ""}, "robot.file: "),
-    "an axis of two numbers": ({"axis": '<axis xyz="0 -1"/>'}, "3 values .* 0 -1"),
-    "an origin that is NaN": ({"origin": '<origin xyz="nan 0 0"/>'}, "3 values .* nan"),
-    "one damping of a planar joint": (
-        {"type": "planar", "dynamics": '<dynamics damping="0"/>', "driven": "none"},
-        "3 values .*damping",
-    ),
-    "a motor of a planar joint": ({"type": "planar", "dynamics": ""}, "'j'"),
-    "Coulomb friction": ({"dynamics": '<dynamics damping="0.1" friction="0.5"/>'}, "joint 'j'"),
-    "no effort": ({"effort": "0"}, "'j'.*effort"),
-    "two actuators on a joint": ({"more": SECOND}, "m, m2"),
-    "a second robot": ({"after": '<robot name="b"/>'}, r"robot\.urdf:10"),
-    "gears of ratio zero": (
-        {"gear": '<drake:gear_ratio xmlns:drake="http://drake.mit.edu" value="0"/>'},
-        "'m'.*0",
-    ),
-}
-
-
-def robot_of(path, changes):
-    path.write_text(URDF.format(**FINE | changes))
-    chosen = scenario(
-        "two_link_wall",
-        "constraints=[]",
-        "outputs=[!JointPositions {joints: [j]}]",
-        "references={j: 0}",
-        "start={}",
-    )
-    object.__setattr__(chosen, "robot", Robot(str(path)))
-    return scenario_model(chosen, SceneGraph())
-
-
-@pytest.mark.parametrize("what", ROBOTS)
-def test_robots_that_drake_would_change_are_refused_by_name(tmp_path, what):
-    changes, message = ROBOTS[what]
-    with pytest.raises(ScenarioError, match=message):
-        robot_of(tmp_path / "robot.urdf", changes)
-
-
-def test_a_quiet_log_hides_no_refusal(tmp_path, caplog):
-    changes, message = ROBOTS["a mass left out"]
-    with caplog.at_level(logging.CRITICAL, "drake"), pytest.raises(ScenarioError, match=message):
-        robot_of(tmp_path / "robot.urdf", changes)
-
-
-def test_the_robot_without_these_is_fine(tmp_path):
-    assert robot_of(tmp_path / "robot.urdf", {}).links.q.numel() == 1
-
-
 def test_a_context_of_another_system_is_refused():
     plants = [RobotPlant(arm("two_link").model, structure=arm("two_link").structure) for _ in "ab"]
     context = plants[1].CreateDefaultContext()
@@ -242,24 +156,3 @@ def test_a_lag_that_is_none_ends_the_run_and_leaves_a_finite_record():
     record = loop.record(context)
     for recorded in record.signals.values():
         assert np.isfinite(recorded.values).all()
-
-
-@pytest.mark.parametrize("change", ["a signal shorter", "a time back", "names left out"])
-def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
-    values = {
-        "time": np.arange(3.0),
-        "x": np.zeros((3, 2)),
-        "x.names": np.array(["a", "b"]),
-        "x.units": np.array(["", ""]),
-    }
-    if change == "a signal shorter":
-        values["x"] = values["x"][:2]
-    elif change == "a time back":
-        values["time"] = np.array([0.0, 2.0, 1.0])
-    else:
-        values["x.names"], values["x.units"] = values["x.names"][:1], values["x.units"][:1]
-    np.savez(tmp_path / "record.npz", **values)
-    with pytest.raises(ModelError, match="record"):
-        Record.load(tmp_path / "record.npz")
-    with pytest.raises(ModelError, match="nowhere"):
-        Record.load("nowhere")

@@ -23,8 +23,7 @@ def run_interpreted(functions: StepFunctions, problem: RunProblem, settings: Ste
     except _Ended as ended:
         (ending,) = ended.args
     rows = np.array(run.rows).reshape(-1, functions.row.numel_out(0))
-    at = run.time, run.state, run.held, run.steps, run.before, run.next
-    return Run(rows, ending, *at, run.trial_time, run.trial)
+    return Run(rows, ending, run.time, run.state, run.held, run.steps)
 
 
 class _Interpreted:
@@ -35,17 +34,13 @@ class _Interpreted:
     ) -> None:
         self.functions, self.problem, self.settings = functions, problem, settings
         self.state, self.held, self.rows = problem.state, problem.held, list[FloatArray]()
-        self.start = self.time = self.mark = self.before = float(problem.times[0])
+        self.start = self.time = self.mark = float(problem.times[0])
         self.event, self.steps, self.is_on = 0, 0, False
-        self.next, self.trial_time, self.trial = np.nan, np.inf, np.full(1, np.nan)
 
     def value(self, name: str, time: float, state: FloatArray) -> FloatArray:
-        """The first result of a function, now; notes the earliest trial without a value."""
+        """The first result of a function, now."""
         given = time, state, self.held, self.problem.parameters
-        value = self.functions.buffered[name](*given)[0].copy()
-        if not np.isfinite(value).all() and time < self.trial_time and np.isfinite(state).all():
-            self.trial_time, self.trial = time, np.array(state)
-        return value
+        return self.functions.buffered[name](*given)[0].copy()
 
     def write(self, time: float, state: FloatArray) -> None:
         self.rows.append(_valid(self.value("row", time, state)))
@@ -127,16 +122,14 @@ class _Interpreted:
             for i in range(1, c.size):
                 stage = self.state + h * (a[i, :i] @ rates[:i])
                 rates[i] = self.value("rate", self.time + float(c[i]) * h, stage)
-            self.next = end
             self.accept(end, _valid(self.state + h * (b @ rates), RunEnding.SPOILT))
 
     def accept(self, time: float, state: FloatArray) -> None:
         """Accepts a step. The run ends where a thousand add hardly any time, or by `look`."""
         self.time, self.state, self.steps, self.is_on = time, state, self.steps + 1, False
-        self.trial_time = np.inf
         if self.steps % PACE_STEPS == 0:
-            self.before, self.mark = self.mark, time
-            if time - self.before < LEAST_PROGRESS * (time - self.start):
+            before, self.mark = self.mark, time
+            if time - before < LEAST_PROGRESS * (time - self.start):
                 raise _Ended(RunEnding.SLOW)
         if self.steps % 64 == 0 and self.settings.look(lambda: np.array(self.rows)):
             raise _Ended(RunEnding.PAUSED)

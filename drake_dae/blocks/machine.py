@@ -52,8 +52,7 @@ class _Run(ctypes.Structure):
     """The Run of stepper.c."""
 
     _fields_ = (
-        *((name, ctypes.c_double) for name in ("time", "step", "start", "mark", "before")),
-        *((name, ctypes.c_double) for name in ("begin", "next", "trial")),
+        *((name, ctypes.c_double) for name in ("time", "step", "start", "mark", "begin")),
         *((name, ctypes.c_longlong) for name in ("row", "event", "steps", "number", "index")),
         *((name, ctypes.c_longlong) for name in ("on", "ending")),
     )
@@ -67,7 +66,7 @@ class _Batch(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("states", "held", "parameters", "noise")),
         *((name, ctypes.c_longlong) for name in ("parameter_step", "noise_step")),
         *((name, ctypes.c_longlong) for name in ("num_rows", "num_events")),
-        *((name, ctypes.c_void_p) for name in ("times", "events", "due", "rows", "trials")),
+        *((name, ctypes.c_void_p) for name in ("times", "events", "due", "rows")),
         *((name, ctypes.c_double) for name in ("longest", "relative")),
         ("absolute", ctypes.c_void_p),
         ("stages", ctypes.c_longlong),
@@ -214,7 +213,6 @@ class _Call:
         start = float(problems.times[0])
         for run in self.runs:
             run.time = run.start = run.mark = start
-            run.trial = np.inf
             run.ending = RunEnding.PAUSED
         self.next = np.zeros(1, dtype=np.longlong)
         tables = settings.tableau or tableau_of("dop853")
@@ -227,13 +225,7 @@ class _Call:
             "due": problems.due,
         }
 
-    def batch(
-        self,
-        first: int,
-        count: int,
-        trial: FloatArray | None = None,
-        next_: np.ndarray | None = None,
-    ) -> _Batch:
+    def batch(self, first: int, count: int, next_: np.ndarray | None = None) -> _Batch:
         """The arguments of some of the runs."""
         problems, settings = self._problems, self._settings
         arrays = {
@@ -242,7 +234,6 @@ class _Call:
             "parameters": problems.parameters[first if len(problems.parameters) > 1 else 0 :],
             "noise": problems.noise[first if len(problems.noise) > 1 else 0 :],
             "rows": self._rows[first:],
-            "trials": np.zeros(0) if trial is None else trial,
             "constants": self.stepper.constants,
             "next": self.next if next_ is None else next_,
             **self._fixed,
@@ -263,10 +254,9 @@ class _Call:
     def alone(self, i: int) -> Run:
         """Makes one run, or goes on with it, until its end, or to where it cannot go on."""
         at, state, held, rows = self.runs[i], self._states[i], self._held[i], self._rows[i]
-        trial, functions = np.full_like(state, np.nan), self.stepper.functions
+        functions, next_ = self.stepper.functions, np.zeros(1, dtype=np.longlong)
         at.ending, budget = RunEnding.PAUSED, FIRST
-        next_ = np.zeros(1, dtype=np.longlong)
-        batch = self.batch(i, 1, trial, next_)
+        batch = self.batch(i, 1, next_)
         while at.ending == RunEnding.PAUSED and not self._settings.look(lambda: rows[: at.row]):
             batch.budget, next_[0] = budget, 0
             began = time.perf_counter()
@@ -280,14 +270,13 @@ class _Call:
                 except InconsistentStateError:
                     break
                 at.on, at.ending = 1, RunEnding.PAUSED
-        return self.ended(i, trial)
+        return self.ended(i)
 
-    def ended(self, i: int, trial: FloatArray | None = None) -> Run:
+    def ended(self, i: int) -> Run:
         """The result of a run."""
         at, rows = self.runs[i], self._rows[i]
         states = self._states[i], self._held[i]
-        numbers = at.steps, at.before, at.next, at.trial
-        return Run(rows[: at.row], RunEnding(at.ending), at.time, *states, *numbers, trial)
+        return Run(rows[: at.row], RunEnding(at.ending), at.time, *states, at.steps)
 
 
 def _step(table: FloatArray) -> int:

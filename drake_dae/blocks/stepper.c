@@ -2,8 +2,7 @@
 
    Python writes in front of this file the sizes of the block, its functions dae_rate, dae_row,
    dae_newton and update_rate, and real.h. Each run has its own time and step. A run that fails is
-   saved as it was before the step that failed; of several side by side it then goes on alone, which
-   finds why. */
+   saved as it was before the step that failed; of several side by side it then goes on alone. */
 
 /* After a Newton step of length REACHED, the error is its square, which is round-off. After one of
    length NEAR, further steps are sure to converge. */
@@ -24,10 +23,7 @@ enum { TRIALS = LANES == 1 ? 1000 : 30 };
 typedef struct {
   double time, step;       /* the state is accepted at this time; what step to try next, 0 if none */
   double start, mark;      /* of the run, and after its last thousand steps */
-  double before;           /* the mark before */
   double from;             /* where a row of fixed steps began, to its end */
-  double next;             /* where the step that failed should have led */
-  double trial;            /* of the earliest trial that failed since the accepted state */
   long long row, event;    /* which come next */
   long long steps;         /* that were accepted */
   long long number, index; /* of fixed steps in this row, and which comes next */
@@ -44,7 +40,7 @@ typedef struct {
   long long num_rows, num_events;
   const double *times, *events;
   const long long *due;     /* the rates of each event, as bits */
-  double *rows, *trials;
+  double *rows;
   double longest, relative;
   const double *absolute;   /* of error control */
   long long stages;         /* of fixed steps; 0 for error control by DOP853 */
@@ -95,8 +91,6 @@ static void save(Lanes *l, int lane, int ending, int is_before) {
   int i;
   for (i = 0; i < SIZE; i++) b->states[number * SIZE + i] = AT(x[i], lane);
   for (i = 0; i < HELD; i++) b->held[number * HELD + i] = AT(held[i], lane);
-  run.next = AT(l->end, lane);
-  run.trial = l->run[lane].trial;
   run.ending = ending;
   b->runs[number] = run;
   AT(l->alive, lane) = 0;
@@ -110,14 +104,6 @@ static void fail(Lanes *l, mask some, int ending) {
   for (lane = 0; lane < LANES; lane++) {
     if (AT(some, lane)) save(l, lane, ending, 1);
   }
-}
-
-/* Notes the earliest trial without a value; only a run alone tells why it fails. */
-static void note(Lanes *l, real time, const real *x) {
-  Run *run = l->run;
-  if (LANES > 1 || AT(time, 0) >= run->trial || !any(are_numbers(x, SIZE))) return;
-  run->trial = AT(time, 0);
-  memcpy(l->batch->trials, x, SIZE * sizeof(double));
 }
 
 /* Computes the derivative of the state; returns for which runs it has a value. */
@@ -163,10 +149,7 @@ static void write(Lanes *l, mask wanted, real time, const real *x) {
     into = b->rows + (l->number[lane] * b->num_rows + l->run[lane].row++) * WIDTH;
     for (i = 0; i < WIDTH; i++) into[i] = AT(values[i], lane);
   }
-  if (any(wanted & ~good)) {
-    note(l, time, x);
-    fail(l, wanted & ~good, INVALID);
-  }
+  fail(l, wanted & ~good, INVALID);
 }
 
 /* Makes the updates of one kind that are due, all at once. */
@@ -367,7 +350,6 @@ static void begin(Lanes *l) {
   for (lane = 0; lane < LANES; lane++) {
     Run *run = &l->run[lane];
     if (!AT(begins, lane)) continue;
-    run->trial = INFINITY;
     l->before[lane] = *run;
     AT(l->time, lane) = AT(l->end, lane) = run->time;
     if (run->time < b->times[run->row]) continue;
@@ -451,9 +433,8 @@ static void decide(Lanes *l, int lane, int is_accepted, int is_on, double factor
   run->on = is_on;
   AT(l->begins, lane) = -1;
   if (++run->steps % 1000) return;
-  run->before = run->mark;
+  if (end - run->mark < 1e-8 * (end - run->start)) save(l, lane, SLOW, 0);
   run->mark = end;
-  if (end - run->before < 1e-8 * (end - run->start)) save(l, lane, SLOW, 0);
 }
 
 /* One trial of all runs. */
@@ -467,7 +448,7 @@ static void step(Lanes *l) {
   for (s = 1; s < stages; s++) {
     const real time = l->time + K(b->c[s]) * l->size;
     weigh(l->size, s, b->a + s * stages, l->x, l->k, reached);
-    if (!any(rates(l, time, reached, l->k[s])) && LANES == 1) note(l, time, reached);
+    rates(l, time, reached, l->k[s]);
   }
   weigh(l->size, stages, b->b, l->x, l->k, reached);
   if (b->stages) {
@@ -483,7 +464,6 @@ static void step(Lanes *l) {
       on = project(l, l->end, reached, accepted);
       if (LANES > 1) fail(l, accepted & ~on, OFF_MANIFOLD);
       valid &= rates(l, l->end, reached, l->k[12]) | ~accepted;
-      if (LANES == 1 && !any(valid)) note(l, l->end, reached);
       accepted &= valid & l->alive;
       write_between(l, accepted, reached);
       accepted &= l->alive;

@@ -265,8 +265,4 @@ class Run:
     state: FloatArray
     held: FloatArray
     steps: int
-    mark: float = np.nan  # the time a thousand steps ago
-    next: float = np.nan  # the end of a step that was not accepted
-    trial_time: float = np.inf  # of the earliest trial that failed
-    trial: FloatArray | None = None
     error: Exception | None = None  # of Drake

@@ -130,7 +130,7 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
                     from drake_dae.pictures.plots import save_plots  # Matplotlib takes a second.
 
                     with complete(folder, PLOTS[0]) as place:
-                        save_plots(loop, record, context, place, summary.accuracy)
+                        save_plots(loop, record, context, place)
                 if wanted.animation and not isinstance(ended, KeyboardInterrupt):
                     title = f"{path.stem}: {scenario.description}".removesuffix(": ")
                     with complete(folder, ANIMATION) as place:

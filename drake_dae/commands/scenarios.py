@@ -48,10 +48,10 @@ def new_command(options: argparse.Namespace) -> int:
     check_unwritten([out], options.force)
     if out.exists() and Path(options.robot).exists() and out.samefile(options.robot):
         raise ModelError(f"'{out}' is the robot's own file; name another file for the scenario")
-    end = time.process_time() + _CHECKED
+    began, end = time.perf_counter(), time.process_time() + _CHECKED
 
     def tell(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
+        print(f"{time.perf_counter() - began:4.1f} s: {text}", file=sys.stderr, flush=True)
 
     def look(context: Context) -> None:
         if time.process_time() > end:

@@ -5,7 +5,6 @@ from enum import Enum
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.derivatives import Elimination
@@ -100,14 +99,11 @@ class Combination:
     name: str
     others: tuple[str, ...]
     factors: FloatArray
-    constant: bool  # Whether the factors are the same at all states.
 
     def __str__(self) -> str:
-        terms = " + ".join(
-            f"{factor:.4g} {other}" for other, factor in zip(self.others, self.factors, strict=True)
-        )
-        varying = "" if self.constant else ", with factors that depend on the state"
-        return f"'{self.name}' ~ {terms.replace('+ -', '- ') or '0'}{varying}"
+        pairs = zip(self.factors, self.others, strict=True)
+        terms = " + ".join(f"{factor:.4g} {other}" for factor, other in pairs)
+        return f"'{self.name}' ~ {terms.replace('+ -', '- ') or '0'}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,25 +127,24 @@ class Violation:
     def __str__(self) -> str:
         what, remedy = self.cause.value
         of_constraints = self.assumption <= 3
-        matrix = "A(x)" if of_constraints else "B(x) of (16)"
-        acts = "the constraint inputs act" if self.assumption == 1 else "the control acts"
-        evidence = f"dependent rows: {'; '.join(map(str, self.combinations))}"
-        evidence = evidence if self.combinations else ""
+        evidence = []
         if self.singular_value is not None:
-            evidence = (
+            evidence.append(
                 f"smallest singular value {self.singular_value:.1e}, rows and columns scaled, "
-                f"below the least_margin of {self.least:.0e}; {evidence}"
+                f"below the least_margin of {self.least:.0e}"
             )
+        if self.combinations:
+            evidence.append(f"dependent rows: {'; '.join(map(str, self.combinations))}")
         names = ", ".join(f"'{name}'" for name in self.names)
         text = what.format(
             count=len(self.names),
             what=f"{'constraint' if of_constraints else 'output'} {names}",
             order=self.order,
             where="" if self.state is None else f" at x = {show(self.state)}",
-            acts=acts,
-            matrix=matrix,
+            acts="the constraint inputs act" if self.assumption == 1 else "the control acts",
+            matrix="A(x)" if of_constraints else "B(x) of (16)",
             deciding=self.deciding,
-            evidence=evidence,
+            evidence="; ".join(evidence),
         ).rstrip("; ")
         text = f"Assumption ({self.assumption}): {text}. {remedy}"
         if self.deciding is None or "{deciding}" in what:
@@ -162,26 +157,22 @@ def find_dependence(
 ) -> tuple[ViolationKind, tuple[Combination, ...]]:
     """Finds how the constraints depend on each other at a state where A(x) is singular."""
     system = manifold.system
-    names = [signal.name for signal in system.constraint_output_signals]
     A = system.matrix("dependence", elimination.constraint_matrix)
-    gradient = system.matrix("dependence", elimination.constraint_gradient)
-
-    def matrices(state: FloatArray) -> list[FloatArray]:
-        p = system.parameter_values
-        return [A(state, p), gradient(state, p) * system.scale]
-
-    least = system.least_margin
-    everywhere = all(smallest_singular_value(equilibrated(matrices(x)[0])) < least for x in states)
+    matrices = [A(x, system.parameter_values) for x in (where, *states)]
+    everywhere = all(
+        smallest_singular_value(equilibrated(each)) < system.least_margin for each in matrices
+    )
     examined = [where, *states] if everywhere else [where]
     in_gradients = all(are_dependent(manifold.gradients(x) * system.scale) for x in examined)
+    last = system.matrix("dependence", elimination.constraint_gradient)
+    gradient = last(where, system.parameter_values) * system.scale
     # Chains may depend on each other below their last derivatives alone.
-    by_gradients = in_gradients and are_dependent(matrices(where)[1])
-    values = [matrices(state)[1 if by_gradients else 0] for state in examined]
+    rows = gradient if in_gradients and are_dependent(gradient) else matrices[0]
     if in_gradients:
         kind = ViolationKind.REDUNDANT if everywhere else ViolationKind.SINGULAR_CONFIGURATION
     else:
         kind = ViolationKind.HIDDEN_DEGREE if everywhere else ViolationKind.CONSTRAINT_RANK
-    return kind, tuple(combinations_of(names, values))
+    return kind, combinations_of([s.name for s in system.constraint_output_signals], rows)
 
 
 def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
@@ -189,35 +180,29 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
     system = samples.system
     if not samples.dependent(system.k):
         return ()
+    ((gradient,), *_) = samples.values(gradient=ca.jacobian(system.k, system.state))
     names = [signal.name for signal in system.constraint_output_signals]
-    values = samples.values(gradient=ca.jacobian(system.k, system.state))
-    return tuple(combinations_of(names, [gradient * system.scale for (gradient,) in values]))
+    return combinations_of(names, gradient * system.scale)
 
 
-def combinations_of(names: list[str], values: list[FloatArray]) -> list[Combination]:
-    """Returns the rows that depend on earlier rows at the first of some states."""
-    scaled = []
-    for value in values:
-        matrix = significant(value)
-        rows, columns = equilibration(matrix)
-        scaled.append((matrix / rows[:, None] / columns, rows))
+def combinations_of(names: list[str], matrix: FloatArray) -> tuple[Combination, ...]:
+    """Returns the rows that depend on earlier ones."""
+    matrix = significant(matrix)
+    rows, columns = equilibration(matrix)
+    scaled = matrix / rows[:, None] / columns
     independent: list[int] = []
     combinations = []
+
+    def fit(row: int, others: list[int]) -> FloatArray:
+        """The factors of the combination of other rows that is nearest to a row."""
+        return np.asarray(np.linalg.lstsq(scaled[others].T, scaled[row])[0])
+
     for i, name in enumerate(names):
-        factors, error = _fit(scaled[0][0], independent, i)
-        if error >= SINGULAR:
+        factors = fit(i, independent)
+        if np.linalg.norm(scaled[i] - factors @ scaled[independent]) >= SINGULAR:
             independent.append(i)
             continue
         used = [j for j, c in zip(independent, factors, strict=True) if abs(c) > SINGULAR]
-        plain, *others = [_fit(m, used, i)[0] * lengths[i] / lengths[used] for m, lengths in scaled]
-        constant = all(np.allclose(other, plain, rtol=1e-6, atol=0.0) for other in others)
-        combinations.append(Combination(name, tuple(names[j] for j in used), plain, constant))
-    return combinations
-
-
-def _fit(matrix: FloatArray, others: list[int], row: int) -> tuple[FloatArray, float]:
-    """The factors of rows whose combination is nearest to another row, and the remainder."""
-    if not others:
-        return np.zeros(0), float(np.linalg.norm(matrix[row]))
-    factors = scipy.linalg.lstsq(matrix[others].T, matrix[row])[0]
-    return factors, float(np.linalg.norm(matrix[row] - factors @ matrix[others]))
+        factors = fit(i, used) * rows[i] / rows[used]
+        combinations.append(Combination(name, tuple(names[j] for j in used), factors))
+    return tuple(combinations)

@@ -101,6 +101,8 @@ class PinnedOutputs:
             "pivot": ca.fmin(pivot, structure.elimination.pivot),
         }
         self.motion = system.trace("pinned motion", motion, inputs)
+        #: Whose exogenous signals, with their derivatives, decide the motion.
+        self.expressions = residual, *motion.values()
 
     def at_time(
         self, reference: TimeFunction, parameters: TimeFunction, time: float
@@ -156,17 +158,14 @@ class PinnedSet:
         system, residual = self.outputs.system, self.residual(state)
         length = np.linalg.norm(self.gradients(state) * system.scale, axis=1)
         missed = np.abs(residual) / positive(length)
-        worst = int(np.argmax(missed))
-        if not np.all(np.isfinite(residual)):
-            why = "have no value near the given state; start inside the domain of the system"
-        elif missed[worst] <= CONSISTENT:
+        worst = int(np.argmax(missed))  # One that is not finite, if there is one.
+        why = (
+            f"are not reached near the given state: {self.outputs.residual_signals[worst].name}"
+            f" stays off by {residual[worst]:.3g}. Request outputs within reach, or start "
+            "closer to a state with these outputs"
+        )
+        if missed[worst] <= CONSISTENT:
             why = f"lead to x = {show(state)}, where A(x) or B(x) is singular"
-        else:
-            why = (
-                f"are not reached near the given state: {self.outputs.residual_signals[worst].name}"
-                f" stays off by {residual[worst]:.3g}. Request outputs within reach, or start "
-                "closer to a state with these outputs"
-            )
         raise InconsistentStateError(f"{system.name}: {self.describe()} {why}", residual)
 
     def project(self, start: FloatArray) -> tuple[FloatArray, bool]:
@@ -288,18 +287,14 @@ def follow(
             points.extend(follower.points(guess))
     except MotionEnd as end:
         ending = end.with_traceback(None)
-
-    def rows(values: list[FloatArray], width: int) -> FloatArray:
-        return np.array(values).reshape(len(points), width)
-
-    moments = times[: len(points)]
-    margins = rows([np.array(point.margins) for point in points], 2)
+    moments, count = times[: len(points)], len(points)
+    margins = np.array([point.margins for point in points]).reshape(count, 2)
     return PinnedMotion(
         moments,
-        rows([point.state for point in points], system.num_states),
-        rows([point.control for point in points], system.num_controls),
-        rows([point.constraint_input for point in points], system.num_constraints),
-        rows([parameters(time) for time in moments], system.parameter_symbol.numel()),
+        np.array([point.state for point in points]).reshape(count, system.num_states),
+        np.array([point.control for point in points]).reshape(count, system.num_controls),
+        np.array([p.constraint_input for p in points]).reshape(count, system.num_constraints),
+        np.array([parameters(t) for t in moments]).reshape(count, system.parameter_symbol.numel()),
         margins[:, 0],
         margins[:, 1],
         ending,

@@ -1,9 +1,8 @@
 """Consistent states in a box, numbers of expressions at them, and members of a family."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, brief, numbers, show
 from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.signals import Indices
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.numerics import NewtonModel, are_dependent, newton, positive
@@ -240,112 +240,90 @@ class Deciding:
 
 
 class Family:
-    """Random members of a system: consistent states, each with parameters in `parameter_box`."""
+    """Members of a system: parameters in `parameter_box`, each with a consistent state."""
 
     def __init__(self, manifold: Manifold, states: FloatArray) -> None:
         self._manifold, self._states = manifold, states
         self._system = manifold.system
+        self._names = [signal.name for signal in self._system.parameter_signals]
 
     def deciding(self, acts: OfMember) -> Deciding | None:
         """Returns the parameters for which an input acts that does not act at the defaults."""
-        hits = [member for member in self._members if acts(*member)]
+        low, high = self._system.parameter_box
+        random, defaults = np.random.default_rng(0), self._system.parameter_values
+        members, free = [], np.flatnonzero(low < high).tolist()
+        for number in range(MEMBERS if free else 0):
+            away = random.uniform(low, high) - defaults
+            for part in NEARER ** np.arange(TRIES):
+                state = self._consistent(
+                    self._states[number % len(self._states)], defaults + part * away
+                )
+                if state is not None:
+                    members.append((state, defaults + part * away))
+                    break
+        hits = [member for member in members if acts(*member)]
         # One of many may be round-off of a nearly singular matrix.
-        if 2 * len(hits) <= len(self._members):
+        if 2 * len(hits) <= len(members):
             return None
-        (state, values), every = hits[0], self._places
-        defaults = self._system.parameter_values
+        near, values = hits[0]
 
-        def acts_with(places: list[int], others: FloatArray, those: FloatArray) -> bool:
+        def acts_with(place: int, others: FloatArray, those: FloatArray) -> bool:
             mixed = others.copy()
-            mixed[places] = those[places]
-            member = self._consistent(state, mixed)
-            return member is not None and bool(acts(*member))
+            mixed[place] = those[place]
+            state = self._consistent(near, mixed)
+            return state is not None and bool(acts(state, mixed))
 
-        chosen = [n for n in every if acts_with(every[n], others=defaults, those=values)]
+        chosen = [i for i in free if acts_with(i, others=defaults, those=values)]
         # No parameter alone decides: those without which it does not act.
-        chosen = chosen or [
-            n for n in every if not acts_with(every[n], others=values, those=defaults)
-        ]
-        pairs = []
-        for name in chosen or every:
-            i = max(every[name], key=lambda i: abs(values[i] - defaults[i]))
-            pairs.append((name, float(values[i]), float(defaults[i])))
-        return Deciding(tuple(pairs))
+        chosen = chosen or [i for i in free if not acts_with(i, others=values, those=defaults)]
+        return self._deciding(chosen or free, values)
 
     def lost(self, margin: OfMember, least: float) -> Deciding | None:
         """Returns parameters within their bounds where a margin is not above the least, or None."""
         system, defaults = self._system, self._system.parameter_values
-        bounded = [p for p in system.parameters if p.bounds is not None]
-        names = [signal.name for p in bounded for signal in p.signals]
-        places = np.concatenate([np.r_[system.parameter_slice(p.name)] for p in bounded])
+        bounded = [system.parameter_slice(p.name) for p in system.parameters if p.bounds]
+        places = np.concatenate([np.r_[each] for each in bounded])
         low, high = (bound[places] for bound in system.parameter_box)
         width, random = high - low, np.random.default_rng(0)
         default = (defaults[places] - low) / positive(width)
 
-        def at(box: FloatArray) -> float:
+        def at(box: FloatArray) -> FloatArray:
             values = defaults.copy()
             values[places] = low + width * box
-            member = self._consistent(self._states[0], values)
-            return UNKNOWN if member is None else min(margin(*member), UNKNOWN)
+            return values
+
+        def least_at(box: FloatArray) -> float:
+            state = self._consistent(self._states[0], at(box))
+            return UNKNOWN if state is None else min(margin(state, at(box)), UNKNOWN)
 
         alone = [np.where(row > 0, end, default) for row in np.eye(places.size) for end in (0, 1)]
         corners = random.integers(0, 2, (CORNERS, places.size))
         inside = random.uniform(size=(CORNERS, places.size))
         tried = np.array([*alone, *np.unique(corners, axis=0), *inside], dtype=float)
-        values = np.array([at(box) for box in tried])
+        values = np.array([least_at(box) for box in tried])
         for k in np.argsort(values, kind="stable")[:STARTS]:
             box, value = tried[k], float(values[k])
             if value > least:
                 found = scipy.optimize.minimize(
-                    at, box, method="L-BFGS-B", bounds=[(0.0, 1.0)] * box.size
+                    least_at, box, method="L-BFGS-B", bounds=[(0.0, 1.0)] * box.size
                 )
                 box, value = found.x, float(found.fun)
             if value <= least:
                 moved = np.abs(box - default)
-                rows = zip(names, low + width * box, defaults[places], moved, strict=True)
-                far = SAME * np.max(moved)
-                return Deciding(
-                    tuple((n, float(v), float(d)) for n, v, d, off in rows if off > far)
-                )
+                return self._deciding(places[moved > SAME * np.max(moved)], at(box))
         return None
 
-    @cached_property
-    def _places(self) -> dict[str, list[int]]:
-        """The parameters and derivatives of signals to draw, with their indices."""
-        exogenous, places, rates = self._system.exogenous, dict[str, list[int]](), {}
-        for p in self._system.parameters:
-            free = np.flatnonzero(p.low < p.high)
-            places[p.name] = (exogenous.slices[p.name].start + free).tolist()
-            for order in range(len(p.derivatives)):
-                first = exogenous.rates[p.name].start + order * p.value.size
-                rates[p.name + "'" * (order + 1)] = (first + free).tolist()
-        return {name: drawn for name, drawn in (places | rates).items() if drawn}
+    def _deciding(self, places: Sequence[int] | Indices, values: FloatArray) -> Deciding:
+        defaults = self._system.parameter_values
+        return Deciding(
+            tuple((self._names[i], float(values[i]), float(defaults[i])) for i in places)
+        )
 
-    @cached_property
-    def _members(self) -> list[tuple[FloatArray, FloatArray]]:
-        if not self._places:
-            return []
-        random, (low, high) = np.random.default_rng(0), self._system.parameter_box
-        defaults, members = self._system.parameter_values, []
-        for number in range(MEMBERS):
-            away = random.uniform(low, high) - defaults
-            state = self._states[number % len(self._states)]
-            for _ in range(TRIES):
-                member = self._consistent(state, defaults + away)
-                if member is not None:
-                    members.append(member)
-                    break
-                away *= NEARER
-        return members
-
-    def _consistent(
-        self, state: FloatArray, parameters: FloatArray
-    ) -> tuple[FloatArray, FloatArray] | None:
+    def _consistent(self, state: FloatArray, parameters: FloatArray) -> FloatArray | None:
         """A consistent state near a state for other parameters; None if there is none."""
         try:
             consistent = self._manifold.project(state, parameters)
         except InconsistentStateError:
             return None
-        fields = fields_at(self._system, consistent, parameters)
-        is_finite = all(np.all(np.isfinite(field)) for field in fields.values())
-        return (consistent, parameters) if is_finite else None
+        fields = fields_at(self._system, consistent, parameters).values()
+        return consistent if all(np.all(np.isfinite(field)) for field in fields) else None

@@ -27,7 +27,7 @@ ROUNDED = 1e-15  # The error of computed eigenvalues, relative to the norm of th
 SHIFT = 1e-7  # The error of an equilibrium, relative to the size of the states.
 # Along a periodic motion:
 ACCURACY = 1e-9  # The error of an integration step, relative to the scale of the states.
-MOST_STEPS = 5000  # The largest number of integration steps in a period.
+MOST_RATES = 20_000  # The largest number of rates that are computed in a period.
 SECTIONS = 16  # The number of parts of a period; after each, the state is projected onto Z(R).
 # A motion is periodic if it returns to within this, relative to the scale of the states.
 CLOSED = 1e-7
@@ -74,23 +74,19 @@ def linearized_eigenvalues(
     free, moved = coordinates(pinned.gradients(state), scale)
     # The tangent directions are known to round-off, relative to the scale of the states.
     least = np.where(moved == 0.0, 0.0, ROUNDED / LINEARIZED * scale[:, None] / scale[free])
-    sizes = np.abs(slopes)
-    off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free]
-    # The numbers of a model are rounded as well, such as the cosine of a right angle.
-    units = scale[free][:, None] / scale[free]
+    sizes, units = np.abs(slopes), scale[free][:, None] / scale[free]
     matrix = (slopes @ moved)[free] / units
-    off = off / units + ROUNDED * np.linalg.norm(matrix, 2)
-    rounded = ROUNDED * float(np.linalg.norm(balanced_matrix(sizes * scale / scale[:, None])[0], 2))
-    values, errors = eigenvalues_of(matrix, off, rounded)
+    off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free] / units
     along = moved @ (scale[free] * np.random.default_rng(0).standard_normal(free.size))
     along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
     nearby = pinned.slopes(state + SHIFT * along)
     if np.all(np.isfinite(nearby)):
-        shifted = (nearby @ moved)[free] / units
-        others, _ = eigenvalues_of(shifted, 0.0 * off)
-        errors += np.min(np.abs(values[:, None] - others), axis=1, initial=np.inf)
-        if _stays_off_the_axis(matrix, off + np.abs(shifted - matrix), rounded):
-            errors = np.minimum(errors, 0.5 * np.abs(values.real))
+        off += np.abs(((nearby - slopes) @ moved)[free] / units)
+    # The numbers of a model are rounded as well, such as the cosine of a right angle.
+    rounded = ROUNDED * float(np.linalg.norm(balanced_matrix(sizes * scale / scale[:, None])[0], 2))
+    values, errors = eigenvalues_of(matrix, off, rounded)
+    if _stays_off_the_axis(matrix, off, rounded):
+        errors = np.minimum(errors, 0.5 * np.abs(values.real))
     return values, errors
 
 
@@ -181,13 +177,13 @@ class PeriodicMotions:
 
     def __init__(self, at: Callable[[float], PinnedSet], scale: FloatArray, period: float) -> None:
         self._at, self._scale, self._period = at, scale, period
+        self._left = MOST_RATES
 
     def judge(self, motion: PinnedMotion) -> StabilityAlong:
         """Judges the periodic motion found near a motion."""
         if not motion.times.size:
             return StabilityAlong(Verdict.UNDECIDED, str(motion.ending), self._period)
         self._check_period(motion.times)
-        over = f"over {self._period:.6g} s"
         # Late, when decaying disturbances are gone; or early, when growing ones are still small.
         late = int(np.count_nonzero(motion.times <= motion.times[-1] - self._period)) - 1
         for first in dict.fromkeys((max(late, 0), 0)):
@@ -200,18 +196,17 @@ class PeriodicMotions:
             order = np.argsort(-np.abs(values), kind="stable")
             values, errors = values[order], errors[order]
             sizes = np.abs(values)
-            reason = f"the largest Floquet multiplier is {sizes[0]:.4g} {over}"
+            verdict = Verdict.STABLE if np.all(sizes < 1.0 - errors) else Verdict.UNDECIDED
+            reason = f"the largest Floquet multiplier is {sizes[0]:.4g}"
             if np.any(sizes > 1.0 + errors):
                 verdict = Verdict.UNSTABLE
                 reason = f"small disturbances of the motion grow: {reason}"
-            elif np.all(sizes < 1.0 - errors):
-                verdict = Verdict.STABLE
-            else:
-                verdict, count = Verdict.UNDECIDED, np.count_nonzero(np.abs(sizes - 1.0) <= errors)
+            elif verdict is Verdict.UNDECIDED:
                 reason = (
-                    f"{count} of {sizes.size} Floquet multipliers are on the unit circle, up to "
-                    f"the error of integration, {over}"
+                    f"{np.count_nonzero(np.abs(sizes - 1.0) <= errors)} of {sizes.size} Floquet "
+                    "multipliers are on the unit circle, up to the error of integration,"
                 )
+            reason += f" over {self._period:.6g} s"
             return StabilityAlong(verdict, reason, self._period, values, state)
         reason = f"no motion with the period {self._period:.6g} s of the reference is found"
         if motion.ending is not None:
@@ -247,14 +242,12 @@ class PeriodicMotions:
         """
         for _ in range(NEWTON_STEPS):
             basis = tangent(self._at(begin).gradients(state), self._scale)
-            later, columns, left = state, basis, MOST_STEPS
+            later, columns, self._left = state, basis, MOST_RATES
             for start, stop in pairwise(np.linspace(begin, begin + self._period, SECTIONS + 1)):
-                later, columns, steps = self._section(later, columns, start, stop, left)
-                later, left = self._onto(later, stop), left - steps
+                later, columns = self._section(later, columns, start, stop)
+                later = self._onto(later, stop)
             scaled = (basis / self._scale[:, None]).T
             matrix = scaled @ (columns / self._scale[:, None])
-            if not np.all(np.isfinite(matrix)):
-                break
             gap = scaled @ ((later - state) / self._scale)
             change = basis @ np.linalg.lstsq(matrix - np.eye(gap.size), -gap, rcond=CARRIED)[0]
             if np.max(np.abs(change) / self._scale) <= CLOSED:
@@ -266,42 +259,28 @@ class PeriodicMotions:
         raise _MotionLost
 
     def _section(
-        self, state: FloatArray, columns: FloatArray, begin: float, end: float, most: int
-    ) -> tuple[FloatArray, FloatArray, int]:
-        """Integrates a state and tangent columns; also returns the number of steps."""
-        n, unit = state.size, self._scale[:, None]
-
-        def split(both: FloatArray) -> tuple[FloatArray, FloatArray]:
-            parts = both.reshape(-1, n).T * unit
-            return parts[:, 0], parts[:, 1:]
-
-        def joined(first: FloatArray, rest: FloatArray) -> FloatArray:
-            return np.asarray((np.column_stack([first, rest]) / unit).T.reshape(-1))
+        self, state: FloatArray, columns: FloatArray, begin: float, end: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Integrates a state and tangent columns."""
+        shape, unit = (1 + columns.shape[1], state.size), self._scale
 
         def rate(time: float, both: FloatArray) -> FloatArray:
-            (x, along), pinned = split(both), self._at(time)
-            moved = joined(pinned.rate(x), pinned.slopes(x, along))
-            if not np.all(np.isfinite(moved)):
+            rows, pinned = both.reshape(shape) * unit, self._at(time)
+            moved = np.vstack([pinned.rate(rows[0]), pinned.slopes(rows[0], rows[1:].T).T]) / unit
+            self._left -= 1
+            is_near = np.abs(both[: state.size]).max() <= bound and np.isfinite(moved).all()
+            if self._left < 0 or not is_near:
                 raise _MotionLost
-            return moved
+            return moved.reshape(-1)
 
-        def slopes(time: float, both: FloatArray) -> FloatArray:
-            # Without second derivatives, for which the iteration of the integrator compensates.
-            matrix = self._at(time).slopes(split(both)[0])
-            blocks = [matrix * self._scale / unit] * (1 + columns.shape[1])
-            return np.asarray(scipy.linalg.block_diag(*blocks), dtype=np.float64)
-
-        y, steps = joined(state, columns), 0
-        bound = GROWN * np.maximum(1.0, np.max(np.abs(y[:n])))
+        y = (np.vstack([state, columns.T]) / unit).reshape(-1)
+        bound = GROWN * np.maximum(1.0, np.abs(y[: state.size]).max())
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # A failed step raises _MotionLost.
-            solver = scipy.integrate.LSODA(
-                rate, begin, y, end, rtol=ACCURACY, atol=ACCURACY, jac=slopes
+            found = scipy.integrate.solve_ivp(
+                rate, (begin, end), y, "LSODA", [end], rtol=ACCURACY, atol=ACCURACY
             )
-            while solver.status == "running":
-                solver.step()
-                steps += 1
-                largest = np.max(np.abs(solver.y[:n]))
-                if solver.status == "failed" or steps > most or not largest <= bound:
-                    raise _MotionLost
-        return (*split(solver.y), steps)
+        if not found.success:
+            raise _MotionLost
+        rows = found.y[:, -1].reshape(shape) * unit
+        return rows[0], rows[1:].T

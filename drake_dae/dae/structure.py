@@ -358,8 +358,8 @@ def control_violation(structure: Structure) -> Violation | None:
     matrix, degrees = structure.control_matrix, structure.output_degrees
     violation = _singular(structure, matrix, margin, signals, degrees, kinds)
     if violation is not None and violation.cause is ViolationKind.CONTROL_RANK:
-        rows = combinations_of([signal.name for signal in signals], [margin.matrix])
-        violation = replace(violation, combinations=tuple(rows))
+        rows = combinations_of([signal.name for signal in signals], margin.matrix)
+        violation = replace(violation, combinations=rows)
     return violation
 
 

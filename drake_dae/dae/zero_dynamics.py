@@ -10,7 +10,6 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
@@ -18,17 +17,9 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive, show, vector
 from drake_dae.dae.manifold import coordinates
-from drake_dae.dae.pinned_motion import (
-    PinnedMotion,
-    PinnedOutputs,
-    PinnedPoint,
-    PinnedSet,
-    TimeFunction,
-    follow,
-)
+from drake_dae.dae.pinned_motion import PinnedMotion, PinnedOutputs, PinnedSet, TimeFunction, follow
 from drake_dae.dae.stability import (
     ROUNDED,
-    ComplexArray,
     PeriodicMotions,
     Stability,
     StabilityAlong,
@@ -70,18 +61,11 @@ class ZeroDynamics:
 
     def __init__(self, system: DaeSystem, *, structure: Structure | None = None) -> None:
         self.structure = structure = structure_of(system, structure, find_structure)
-        self.system = system
-        self.dimension = structure.zero_dynamics_dimension
+        self.system, self.dimension = system, structure.zero_dynamics_dimension
         self._pinned = PinnedOutputs(structure)
+        self.residual_signals = self._pinned.residual_signals
         examined = np.abs(structure.states).max(axis=0)
         self._sizes = np.maximum(examined, system.spread_around(system.nominal_state))
-        # The rates of states with a constant rate, such as clocks.
-        explicit, self._clocks = system.explicit, np.zeros(system.num_states)
-        inputs = ca.horzcat(explicit.g, explicit.h)
-        for i in range(system.num_states):
-            if not inputs[i, :].nnz() and explicit.f[i].is_constant():
-                self._clocks[i] = float(explicit.f[i])
-        self.residual_signals = self._pinned.residual_signals
 
     def __repr__(self) -> str:
         return f"ZeroDynamics('{self.system.name}', dimension={self.dimension})"
@@ -134,55 +118,6 @@ class ZeroDynamics:
         return follow(self._pinned, reference, grid, start, self._moving(p, exogenous))
 
     @checked(ModelError)
-    def equilibrium(
-        self,
-        outputs: ArrayLike,
-        guess: ArrayLike | None = None,
-        parameters: ArrayLike | None = None,
-    ) -> FloatArray:
-        """Returns a state at rest, x' = 0, with constant outputs, by Newton's method from a guess.
-
-        The Jacobian is not singular there: of states at rest that are not isolated none is
-        returned.
-
-        Raises:
-            InconsistentStateError: No state near the guess has these outputs; or there are such
-                states, but no equilibrium: `residual` is then x', shape (n,).
-        """
-        start, p = self._guess(guess), self.system.parameter_vector(parameters)
-        return self._at_rest(self._resting(start, outputs, p), start)[0]
-
-    @checked(ModelError)
-    def eigenvalues(
-        self,
-        state: ArrayLike,
-        parameters: ArrayLike | None = None,
-        outputs: ArrayLike | None = None,
-    ) -> ComplexArray:
-        """Returns the eigenvalues at an equilibrium, in 1/s, largest real part first.
-
-        The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; these are its
-        eigenvalues there. In closed loop they stand beside the roots of (32). Those of a linear
-        system are its invariant zeros. `outputs` are as in `stability`: give them if the choice is
-        not unique, as for a force that does not affect the motion.
-
-        Raises:
-            ModelError: The state is not an equilibrium on N*.
-        """
-        x, p = self._guess(state), self.system.parameter_vector(parameters)
-        pinned = self._resting(x, outputs, p)
-        onto, _ = pinned.project(x)
-        unrest = self._unrest(pinned, pinned.point(x))
-        off = np.any(np.abs(onto - x) > AT_REST * np.maximum(self.system.scale, np.abs(x)))
-        if off or unrest:
-            reason = "it is off N*, or its outputs change" if off else unrest
-            raise ModelError(
-                f"{self.system.name}: x = {show(x)} is no regular equilibrium: {reason}. "
-                "Eigenvalues belong to an equilibrium; 'equilibrium' finds one"
-            )
-        return linearized_eigenvalues(pinned, self._sizes, x)[0]
-
-    @checked(ModelError)
     def stability(
         self,
         state: ArrayLike | None = None,
@@ -190,6 +125,10 @@ class ZeroDynamics:
         outputs: ArrayLike | None = None,
     ) -> Stability:
         """Judges by linearization whether Assumption 2.2 holds near an equilibrium.
+
+        The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; its
+        eigenvalues there decide. In closed loop they stand beside the roots of (32). Those of a
+        linear system are its invariant zeros.
 
         Args:
             state: The initial guess of the equilibrium.
@@ -219,15 +158,17 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> FloatArray:
-        """Returns the equilibria with the same outputs, found from guesses, shape (l, n).
+        """Returns states at rest, x' = 0, with constant outputs, found from guesses, shape (l, n).
 
-        The guesses have shape (k, n), `structure.states` if None; if `outputs` are None, those of
-        the first guess are taken, which must be near N*.
+        The Jacobian is not singular there: of states at rest that are not isolated none is
+        returned. The guesses have shape (k, n), `structure.states` if None; if `outputs` are None,
+        those of the first guess are taken, which must be near N*.
         """
         p = self.system.parameter_vector(parameters)
         rows = self.structure.states if guesses is None else numbers("guesses", guesses)
         starts = [self._guess(row) for row in np.atleast_2d(rows)]
-        pinned = self._resting(self.structure.manifold.project(starts[0], p), outputs, p)
+        first = starts[0] if outputs is not None else self.structure.manifold.project(starts[0], p)
+        pinned = self._resting(first, outputs, p)
         distinct = np.zeros((0, self.system.num_states))
         for start in starts:
             try:
@@ -276,13 +217,8 @@ class ZeroDynamics:
         """Returns the function t -> values of all parameters."""
         if not exogenous:
             return lambda time: parameters
-        structure, system = self.structure, self.system
-        needed = [structure.manifold.residual_expression, structure.chain, structure.drift]
-        needed += [structure.control_matrix, structure.elimination.constraint_matrix]
-        needed += [structure.elimination.alpha]
-        if system.control_metric is not None:
-            needed += [system.control_metric, system.free_control]
-        degrees = system.exogenous.degrees(*needed)
+        system = self.system
+        degrees = system.exogenous.degrees(*self._pinned.expressions)
         ends = np.cumsum([0, *(reference.size for reference in exogenous)])
         if ends[-1] != len(degrees):
             raise ModelError(
@@ -322,7 +258,7 @@ class ZeroDynamics:
             chain = pinned.residual(state)[-layout.chain_size :]
             reference[layout.lowest[layout.dynamic]] = chain[layout.heads]
         direct = layout.lowest[layout.direct]
-        if direct.size and not self._clocks.any():
+        if direct.size:
             still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
             slopes, rate = pinned.slopes(state, still, by), pinned.rate(state)
             if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
@@ -340,15 +276,6 @@ class ZeroDynamics:
         state; none if it must be regular.
         """
         system, scale = self.system, self.system.scale
-        if self._clocks.any():
-            pairs = zip(system.state_signals, self._clocks, strict=True)
-            running = ", ".join(f"{signal.name}' = {rate:g}" for signal, rate in pairs if rate)
-            raise InconsistentStateError(
-                f"{system.name}: no state is an equilibrium, since {running} at all of "
-                "them, as for a clock: time must not be a state. Take it out of the state, as an "
-                "exogenous signal, or judge the zero dynamics along a motion",
-                self._clocks,
-            )
 
         def linearize(z: FloatArray) -> NewtonModel | None:
             gradients = pinned.gradients(scale * z) * scale
@@ -370,12 +297,17 @@ class ZeroDynamics:
 
         z, converged = newton(pinned.state(guess) / scale, linearize)
         point = pinned.point(scale * z)
-        unrest = self._unrest(pinned, point)
+        unrest, degenerate = point.flaw, 0
+        if not unrest:
+            slow = np.abs(point.rate) <= AT_REST * np.abs(pinned.slopes(point.state)) @ self._sizes
+            worst = int(np.argmax(np.where(slow, 0.0, point.unrest)))
+            if not slow[worst] and point.unrest[worst] > AT_REST:
+                unrest = f"{system.state_signals[worst].name}' = {point.rate[worst]:.3g}"
         if not converged:
             unrest = unrest or "the rates are small and do not vanish"
-        degenerate = 0 if unrest else self._degenerate(pinned, point.state)
-        if regular and degenerate:
-            unrest = "the Jacobian is singular"
+        if not unrest:
+            degenerate = self._degenerate(pinned, point.state)
+            unrest = "the Jacobian is singular" if regular and degenerate else ""
         if unrest:
             raise InconsistentStateError(
                 f"{system.name}: {pinned.describe()} have no regular state at rest near the given "
@@ -383,17 +315,6 @@ class ZeroDynamics:
                 point.rate,
             )
         return point.state, degenerate
-
-    def _unrest(self, pinned: PinnedSet, point: PinnedPoint) -> str:
-        """Returns why a point is no regular state at rest, as text; empty if it is one."""
-        if point.flaw:
-            return point.flaw
-        slow = np.abs(point.rate) <= AT_REST * np.abs(pinned.slopes(point.state)) @ self._sizes
-        unrest = np.where(slow, 0.0, point.unrest)
-        worst = int(np.argmax(unrest))
-        if unrest[worst] <= AT_REST:
-            return ""
-        return f"{self.system.state_signals[worst].name}' = {point.rate[worst]:.3g}"
 
     @np.errstate(all="ignore")  # The domain may end near the state.
     def _degenerate(self, pinned: PinnedSet, state: FloatArray) -> int:
@@ -405,8 +326,7 @@ class ZeroDynamics:
             slopes = pinned.slopes(x) @ moved
             return np.asarray(slopes[free] * scale[free] / scale[free][:, None])
 
-        slopes = slopes_at(state)
-        rate = (pinned.rate(state) / scale)[free]
+        slopes, rate = slopes_at(state), (pinned.rate(state) / scale)[free]
         if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate))):
             return free.size
         left, sizes, right = np.linalg.svd(slopes)
@@ -414,11 +334,8 @@ class ZeroDynamics:
         rates = np.abs(left.T @ rate) + ROUNDED * np.abs(left.T) @ (terms / scale)[free]
         count = 0
         for u, size, v, rest in zip(left.T, sizes, right, rates, strict=True):
-            isolated = size > 0.0 and rest <= ISOLATED * size
-            if isolated:
-                along = moved @ (scale[free] * v)
-                along *= NEARBY / np.max(np.abs(along) / scale)
-                changes = [u @ (slopes_at(x) - slopes) @ v for x in (state + along, state - along)]
-                isolated = all(abs(change) <= SAME * size for change in changes)
-            count += not isolated
+            along = moved @ (scale[free] * v)
+            along *= NEARBY / np.max(np.abs(along) / scale)
+            change = [abs(u @ (slopes_at(state + x) - slopes) @ v) for x in (along, -along)]
+            count += not (size > 0.0 and rest <= ISOLATED * size and max(change) <= SAME * size)
         return count

@@ -18,7 +18,7 @@ from drake_dae.blocks.block import stacked
 from drake_dae.blocks.compose import Composed, Port
 from drake_dae.blocks.stepping import StepFunctions
 from drake_dae.dae import Signal
-from drake_dae.errors import ModelError, SimulationError
+from drake_dae.errors import ModelError
 
 TEMPLATES = Path(__file__).with_name("c99")
 
@@ -130,8 +130,6 @@ def identifiers(vectors: Vectors) -> dict[str, Sequence[Signal]]:
     for name, signals in vectors.items():
         word = re.sub(r"\W+", "_", name, flags=re.ASCII)
         word = f"v_{word}" if not word or word[0].isdigit() else word
-        while word in by_word:
-            word += "_"
         if signals:
             by_word[word] = signals
     return by_word
@@ -159,7 +157,7 @@ def numbers(values: FloatArray) -> str:
 
 def strings(texts: Iterable[str]) -> str:
     """A C initializer list of strings, with a null pointer at its end."""
-    rows = ",\n  ".join([*map(string, texts), "0"])
+    rows = ",\n  ".join([*(f'"{comment(text)}"' for text in texts), "0"])
     return f"{{{rows}}}"
 
 
@@ -170,17 +168,8 @@ def braced(items: Sequence[str]) -> str:
 
 
 def comment(text: str) -> str:
-    """Text for a C comment, without characters that could end the comment."""
+    """Text for a comment or a string of C, without characters that could end it."""
     return re.sub(r"[^\w .,:;()\[\]'/^+-]|/(?=[/*])", "_", text, flags=re.ASCII)
-
-
-def string(text: str) -> str:
-    """A C string literal; special characters, and "?" because of trigraphs, are octal escapes."""
-    plain = (
-        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"?\\' else f"\\{byte:03o}"
-        for byte in text.encode()
-    )
-    return f'"{"".join(plain)}"'
 
 
 def write_replay(
@@ -188,10 +177,10 @@ def write_replay(
 ) -> list[Path]:
     """Writes play_name_kind.c, name_kind_run.csv, a Makefile and the licence; see play.c."""
     own = identifiers(code.outputs).items()
-    sizes = braced([f"{{{string(key)}, {len(signals)}}}" for key, signals in own])
+    sizes = braced([f'{{"{key}", {len(signals)}}}' for key, signals in own])
     file = f"{file_of(name)}_{kind}"
     files = {f"play_{file}.c": "play.c", "Makefile": "Makefile", "LICENSE.txt": "LICENSE.txt"}
-    common = {"kind": kind, "KIND": kind.upper(), "most": str(MOST), "output_sizes": sizes}
+    common = {"kind": kind, "most": str(MOST), "output_sizes": sizes}
     paths = written(folder, files, {**code.words(name), **common, **words})
     table = Path(folder) / f"{file}_run.csv"
     table.write_text(run, encoding="utf-8")
@@ -206,12 +195,8 @@ def recorded_run(
     code: BlockCode,
     inputs: Mapping[str, Port],
     outputs: Mapping[str, Port],
-    acts_at_once: bool = False,
 ) -> str:
-    """A run as CSV: each line has the time in s, the inputs, and the resulting outputs.
-
-    Inputs are those before the updates of the instant, outputs those after, or at once before.
-    """
+    """A run as CSV: the time in s, inputs before the updates of the instant, outputs after them."""
     simulator = Simulator(diagram, context.Clone())
     ApplySimulatorConfig(config, simulator)
     own = simulator.get_mutable_context()
@@ -230,18 +215,9 @@ def recorded_run(
     names = [signal.name.replace(",", " ") for signals in vectors for signal in signals]
     lines = [",".join(["time", *names])]
     for time in times:
-        try:
-            if time > own.get_time():
-                simulator.AdvanceTo(time)
-            row = [own.get_time(), *values(inputs)]
-            if acts_at_once:
-                row += values(outputs)
-            simulator.AdvancePendingEvents()
-            if not acts_at_once:
-                row += values(outputs)
-        except SimulationError:
-            if len(lines) == 1:
-                raise
-            break
-        lines.append(",".join(map(repr, row)))
+        if time > own.get_time():
+            simulator.AdvanceTo(time)
+        row = [own.get_time(), *values(inputs)]
+        simulator.AdvancePendingEvents()
+        lines.append(",".join(map(repr, [*row, *values(outputs)])))
     return "\n".join([*lines, ""])

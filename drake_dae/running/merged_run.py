@@ -115,15 +115,10 @@ class MergedRun:
                 is_wired = (system, i) in self._leaves.sources
                 if not is_wired and is_vector and port.HasValue(at_system):
                     copy.get_input_port(i).FixValue(local, port.Eval(at_system))
-        at_block, x = one.GetMyMutableContextFromRoot(own), np.zeros(composed.block.state.numel())
-        for system, part in composed.states.items():
-            x[part] = context_in(system, context).get_continuous_state_vector().CopyToVector()
+        at_block, (x, held) = one.GetMyMutableContextFromRoot(own), states_in(composed, context)
         at_block.SetContinuousState(x)
-        for (system, i), (group, part) in composed.held.items():
-            index = [*composed.block.held].index(group)
-            held = at_block.get_discrete_state(index).CopyToVector()
-            held[part] = context_in(system, context).get_discrete_state(i).CopyToVector()
-            at_block.SetDiscreteState(index, held)
+        for index, values in enumerate(held.values()):
+            at_block.SetDiscreteState(index, values)
         values = parameters_in(composed, context)
         if values.size:
             at_block.get_mutable_numeric_parameter(0).SetFromVector(values)
@@ -207,14 +202,10 @@ class MergedRun:
         context.SetTime(own.get_time())
         self.steps += count
         at_block = self._block.GetMyContextFromRoot(own)
-        if composed.states:
-            x = at_block.get_continuous_state_vector().CopyToVector()
-            for system, part in composed.states.items():
-                system.GetMyMutableContextFromRoot(context).SetContinuousState(x[part])
-        groups = {name: i for i, name in enumerate(composed.block.held)}
-        for (system, index), (name, part) in composed.held.items():
-            values = at_block.get_discrete_state(groups[name]).value()[part]
-            system.GetMyMutableContextFromRoot(context).SetDiscreteState(index, values)
+        names = enumerate(composed.block.held)
+        held = {name: at_block.get_discrete_state(i).value() for i, name in names}
+        x = at_block.get_continuous_state_vector().CopyToVector()
+        put_states(composed, context, x, held)
         for system, copy in self._copies.items():
             at_copy = copy.GetMyMutableContextFromRoot(own)
             if isinstance(system, VectorLogSink):
@@ -249,6 +240,27 @@ def upstream(leaves: Leaves, ports: Iterable[Port], ends: Container[Port] = ()) 
             found.add(port[0])
             todo += [source for place, source in leaves.sources.items() if place[0] is port[0]]
     return found
+
+
+def states_in(composed: Composed, context: Context) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """The state of a block and its held values, by their groups, in a context of the diagram."""
+    x = np.zeros(composed.block.state.numel())
+    held = {name: np.zeros(each.symbol.numel()) for name, each in composed.block.held.items()}
+    for system, part in composed.states.items():
+        x[part] = context_in(system, context).get_continuous_state_vector().CopyToVector()
+    for (system, i), (group, part) in composed.held.items():
+        held[group][part] = context_in(system, context).get_discrete_state(i).value()
+    return x, held
+
+
+def put_states(
+    composed: Composed, context: Context, x: FloatArray, held: Mapping[str, FloatArray]
+) -> None:
+    """Sets the states of the diagram in its context: the inverse of `states_in`."""
+    for system, part in composed.states.items():
+        context_in(system, context).SetContinuousState(x[part])
+    for (system, i), (group, part) in composed.held.items():
+        context_in(system, context).SetDiscreteState(i, held[group][part])
 
 
 def parameters_in(composed: Composed, context: Context) -> FloatArray:

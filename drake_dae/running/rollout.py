@@ -1,39 +1,27 @@
 """Rollouts: runs of a whole diagram without Drake's Simulator."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common import RandomGenerator
-from pydrake.systems.analysis import Simulator, SimulatorConfig
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.blocks.failures import (
-    PACE_STEPS,
-    cannot_go_on,
-    endless_steps,
-    no_step_leads_on,
-    off_manifold,
-    spoilt_step,
-)
+from drake_dae.blocks.failures import cannot_go_on
 from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
 from drake_dae.blocks.stepping import Look, Run, RunEnding, RunProblem, StepSettings
+from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
-from drake_dae.errors import (
-    DrakeDaeError,
-    InconsistentStateError,
-    ModelError,
-    NonFiniteError,
-    SimulationError,
-)
-from drake_dae.running.diagnosis import IN_ROLLOUT, MANY, RunWatch, warn_if_stiff
+from drake_dae.errors import DrakeDaeError, ModelError, SimulationError
+from drake_dae.running.diagnosis import with_cause
 from drake_dae.running.merged_run import NO_EVENTS, MergedRun
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, Seed, program_of
 from drake_dae.running.simulate import check_config
@@ -45,8 +33,9 @@ STAGES_PER_SECOND = 500  # An estimate of the evaluations in a simulated second 
 # The time that runs side by side save per evaluation, over that of an interpreted one.
 FASTER = 0.05
 LOOKED = 64  # The rows after which a run by Drake looks whether it diverges, or is to stop.
-# The most failed runs of one call whose cause is looked for, which takes up to a second each.
-DIAGNOSED = 8
+# The most failed runs of one call that Drake's Simulator continues to tell why they failed, and for
+# how long under error control, in s.
+DIAGNOSED, FARTHEST = 8, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,23 +122,9 @@ def rollout(
 
     Warns:
         MachineCodeWarning: Machine code was requested, or would pay, and cannot be made.
-        UserWarning: The loop is stiff, so that explicit steps are many.
     """
-    found = run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
-    if not isinstance(loop, ClosedLoop) or sum(r.failure is not None for r in found) > DIAGNOSED:
-        return found
-    return [diagnosed(loop, one, config) for one in found]
-
-
-def diagnosed(loop: ClosedLoop, rollout: Rollout, config: SimulatorConfig | None = None) -> Rollout:
-    """A rollout whose failure says its cause, as that of a simulation does."""
-    if rollout.failure is None or not rollout.record.time.size:
-        return rollout
-    context, record = loop.diagram.CreateDefaultContext(), rollout.record
-    context.SetTime(float(record.time[0]))
-    loop.set_state(context, record["state"][0])
-    watch = RunWatch(loop.diagram, context, config or SimulatorConfig(), 1.0)
-    return replace(rollout, failure=watch.with_cause(rollout.failure))
+    more: dict[str, Any] = {"config": config, "compiled": compiled, "seeds": seeds}
+    return run_loop(loop, starts, parameters, times, **more)
 
 
 def run_loop(
@@ -173,6 +148,11 @@ def run_loop(
     """
     config = config or SimulatorConfig()
     check_config(config)
+
+    def stop(rows: Callable[[], FloatArray]) -> bool:
+        return look is not None and look(lambda after: program.record(moments, rows(), after))
+
+    code, lanes = None, None
     with MAKING:
         program = program_of(loop)
         choice: Compiled = program.choice if compiled is None else compiled
@@ -183,61 +163,45 @@ def run_loop(
         if not (moments[1:] > moments[:-1]).all():
             raise ModelError("times must be strictly increasing")
         problems = program.problems(starts, parameters, moments, seeds)
-        is_shared = program.shares(problems.parameters, len(problems.state))
-
-    def stop(rows: Callable[[], FloatArray]) -> bool:
-        return look is not None and look(lambda after: program.record(moments, rows(), after))
-
-    seconds = len(problems.state) * float(np.ptp(moments)) if lasting is None else lasting
-    runs = dict[int, Run]()
-    for of in (True, False):
-        indices = np.flatnonzero(is_shared == of)
-        if not indices.size:
-            continue
-        with MAKING:
-            kind = program.shared if of else program
-            some = kind.some(problems, indices)
-            settings = StepSettings.of(config, kind.functions, stop)
-            calls: float = STAGES_PER_SECOND
-            if settings.tableau is not None:
-                calls = len(settings.tableau.b) / settings.longest
-            calls = seconds * (calls + sum(1.0 / rate.period for rate in kind.functions.rates))
-            lanes, code = None, kind.machine_code(choice, calls, lasting is None)
-            if code is not None and look is None and indices.size >= SEVERAL:
-                lanes = kind.machine_code(choice, FASTER * calls, lasting is None, several=True)
-        if code is not None and lanes is not None:
-            made = run_several(lanes, code, some, settings)
-        elif code is not None:
-            made = run_alone(code, some, settings)
-        elif kind.drake is not None:
-            of_run = [None if seeds is None else seeds[i] for i in indices.tolist()]
-            given = config, choice, settings.look
-            made = [_run_by_drake(kind, some.run(i), s, *given) for i, s in enumerate(of_run)]
-        else:
-            each = map(some.run, range(indices.size))
-            made = [run_interpreted(kind.functions, one, settings) for one in each]
-        runs |= zip(indices.tolist(), made, strict=True)
-    if settings.tableau is None:
-        most = max(runs.values(), key=lambda run: run.steps)
-        if most.steps >= MANY and most.ending is RunEnding.DONE:  # A failure says its own cause.
-            context = program.context.Clone()
-            program.put(context, most.time, most.state, most.held, problems.run(0).parameters)
-            pace = (most.time - moments[0]) / most.steps
-            warn_if_stiff(program.diagram, context, pace, most.steps, IN_ROLLOUT)
-    found = []
-    for i in range(len(problems.state)):
-        failure = None
-        if runs[i].ending not in (RunEnding.DONE, RunEnding.PAUSED):
-            with MAKING:
-                failure = _failure(program, problems.run(i).parameters, runs[i])
-        found.append(Rollout(runs[i].steps, failure, program, moments, runs[i].rows))
-    return found
+        count, own = len(problems.state), problems
+        kind, problems = program.for_numbers(problems)
+        functions, settings = kind.functions, StepSettings.of(config, kind.functions, stop)
+        calls: float = STAGES_PER_SECOND
+        if settings.tableau is not None:
+            calls = len(settings.tableau.b) / settings.longest
+        calls += sum(1.0 / rate.period for rate in functions.rates)
+        calls *= count * float(np.ptp(moments)) if lasting is None else lasting
+        code = kind.machine_code(choice, calls, lasting is None)
+        if code is not None and look is None and count >= SEVERAL:
+            lanes = kind.machine_code(choice, FASTER * calls, lasting is None, several=True)
+    each = [problems.run(i) for i in range(count)]
+    if code is not None and lanes is not None:
+        runs = run_several(lanes, code, problems, settings)
+    elif code is not None:
+        runs = run_alone(code, problems, settings)
+    elif kind.drake is None:
+        runs = [run_interpreted(functions, one, settings) for one in each]
+    else:
+        given = [{}] * count if seeds is None else [kind.seeds(seed) for seed in seeds]
+        more = config, choice, settings.look
+        runs = [_run_by_drake(kind, one, s, *more) for one, s in zip(each, given, strict=True)]
+    failures = [
+        i for i, run in enumerate(runs) if run.ending not in (RunEnding.DONE, RunEnding.PAUSED)
+    ]
+    with MAKING:
+        reasons = {
+            i: _failure(program, runs[i], own.run(i).parameters, config, n < DIAGNOSED)
+            for n, i in enumerate(failures)
+        }
+    return [
+        Rollout(run.steps, reasons.get(i), program, moments, run.rows) for i, run in enumerate(runs)
+    ]
 
 
 def _run_by_drake(
     program: RolloutProgram,
     problem: RunProblem,
-    seed: Seed | None,
+    seeds: Mapping[str, int],
     config: SimulatorConfig,
     compiled: Compiled,
     look: Look,
@@ -245,10 +209,9 @@ def _run_by_drake(
     """A run of a diagram with a plant that only Drake steps, by its Simulator."""
     context, rows = program.context.Clone(), list[FloatArray]()
     program.put(context, float(problem.times[0]), problem.state, problem.held, problem.parameters)
-    for number, source in enumerate(program.sources.values()):
-        if (chosen := program.seed_of(seed, number)) is not None:
-            generator = RandomGenerator(chosen)
-            source.SetRandomContext(source.GetMyMutableContextFromRoot(context), generator)
+    for name, seed in seeds.items():
+        source = program.sources[name]
+        source.SetRandomContext(context_in(source, context), RandomGenerator(seed))
     assert program.drake is not None
     program.drake.ExecuteInitializationEvents(program.drake.GetMyMutableContextFromRoot(context))
     ending, error = RunEnding.DONE, None
@@ -272,62 +235,37 @@ def _run_by_drake(
     return Run(table, ending, context.get_time(), state, held, run.steps, error=error)
 
 
-def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> SimulationError:
-    """The exception that the same run raises in Drake's Simulator."""
-    if isinstance(run.error, SimulationError):
-        return run.error
-    if run.error is not None:
-        return cannot_go_on(run.time, run.held[program.drake_state], str(run.error))
+def _failure(
+    program: RolloutProgram,
+    run: Run,
+    parameters: FloatArray,
+    config: SimulatorConfig,
+    is_diagnosed: bool,
+) -> SimulationError:
+    """What Drake's Simulator says where a run ended, from its last accepted state on."""
     plants = [s for s in program.composed.states if isinstance(s, Plant)]
     state = run.state[program.composed.states[plants[0]] if plants else slice(program.num_states)]
-    trial = None
-    if np.isfinite(run.trial_time) and run.trial is not None:
-        trial = _reason(program, parameters, run.trial_time, run.trial, run.held)
-    match run.ending:
-        case RunEnding.OFF_MANIFOLD:
-            try:
-                program.functions.projected(run.time, run.state, run.held, parameters)
-            except InconsistentStateError as error:
-                return off_manifold(run.time, state, error)
-        case RunEnding.SLOW:
-            return endless_steps(program.name, PACE_STEPS, run.mark, run.time, state)
-        case RunEnding.SPOILT:
-            return spoilt_step(program.name, run.time, run.next, state, trial)
-        case RunEnding.STUCK if trial is not None:
-            return no_step_leads_on(program.name, run.time, state, trial)
-        case RunEnding.STUCK:
-            reason = "no step, however short, is as accurate as it should be"
-            return cannot_go_on(run.time, state, reason, "choose a lower accuracy")
-    found = _reason(program, parameters, run.time, run.state, run.held) or trial
-    return found or NonFiniteError(
-        f"{program.name}: a signal has no value at t = {run.time:.6g} s", run.time, state
-    )
-
-
-def _reason(
-    program: RolloutProgram,
-    parameters: FloatArray,
-    time: float,
-    state: FloatArray,
-    held: FloatArray,
-) -> SimulationError | None:
-    """What the diagram as wired raises at these values, or within its next samples; or None."""
-    if not np.isfinite(state).all():
-        return None
-    context, diagram = program.context.Clone(), program.diagram
-    program.put(context, time, state, held, parameters)
-    try:
-        diagram.EvalTimeDerivatives(context)
-        for port in program.ports.values():
-            system = port.get_system()
-            port.Eval(context if system is diagram else system.GetMyContextFromRoot(context))
-        if program.functions.rates:
-            simulator = Simulator(diagram, context)
-            simulator.Initialize(NO_EVENTS)
-            simulator.AdvanceTo(time + 1e-6 * min(r.period for r in program.functions.rates))
-            simulator.AdvancePendingEvents()
-    except SimulationError as error:
+    if run.error is not None:
+        return cannot_go_on(run.time, run.held[program.drake_state], str(run.error))
+    reason = f"{program.name} has no value, or no step is as accurate as it should be"
+    error = cannot_go_on(run.time, state, reason, "choose other steps")
+    if not is_diagnosed:
         return error
-    except (DrakeDaeError, RuntimeError):
-        return None
-    return None
+    context, diagram, loop = program.context.Clone(), program.diagram, program.loop
+    simulator = Simulator(diagram, context)
+    ApplySimulatorConfig(config, simulator)  # It sets the time, too.
+    program.put(context, run.time, run.state, run.held, parameters)
+    seconds = FARTHEST if config.use_error_control else 2.0 * config.max_step_size
+    try:
+        simulator.Initialize(NO_EVENTS)
+        for system in program.composed.systems:
+            if isinstance(system, TracedSystem):
+                system.begin_run(context_in(system, context))
+        for port in program.ports.values():
+            port.Eval(context)
+        simulator.AdvanceTo(run.time + seconds)
+    except SimulationError as raised:
+        error = raised
+    except RuntimeError as raised:
+        error = cannot_go_on(run.time, state, str(raised))
+    return with_cause(error, loop.plant, loop.controller) if isinstance(loop, ClosedLoop) else error

@@ -4,17 +4,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise, starmap
-from numbers import Integral
 from threading import RLock
 from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common import RandomDistribution, RandomGenerator
+from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, EventStatus, PortDataType
-from pydrake.systems.primitives import RandomSource
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus, PortDataType
+from pydrake.systems.primitives import LogVectorOutput, RandomSource
 
 from drake_dae.arguments import uncollected
 from drake_dae.arrays import FloatArray, brief, by_columns, numbers
@@ -27,7 +26,7 @@ from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError
-from drake_dae.running.merged_run import parameters_in
+from drake_dae.running.merged_run import parameters_in, put_states, states_in
 from drake_dae.systems.ideal_plants import DaePlant
 from drake_dae.systems.plant import ParameterizedSystem, plants_in
 from drake_dae.trace.compiled import Compiled, attempts
@@ -43,18 +42,12 @@ class RolloutProgram:
     """A closed loop, or any diagram, as one block, whose inputs became parameters and held values.
 
     `drake` is the `ContactPlant` that Drake steps, `signals` are the columns of a row, and `choice`
-    is whether it becomes machine code by default. The context has values of ports without a wire.
-    With `like`, each plant shares the parameters of its law, and `columns` are its parameters among
-    those of `like`.
+    is whether it becomes machine code by default. With `like`, each plant shares the parameters of
+    its law, and `columns` are its parameters among those of `like`.
     """
 
     @uncollected
-    def __init__(
-        self,
-        loop: ClosedLoop | Diagram,
-        context: Context | None = None,
-        like: "RolloutProgram | None" = None,
-    ) -> None:
+    def __init__(self, loop: ClosedLoop | Diagram, like: "RolloutProgram | None" = None) -> None:
         self.loop, self.made = loop, dict[str, Any]()
         signals, self.choice = dict[str, Sequence[Signal]](), cast(Compiled, "auto")
         if isinstance(loop, ClosedLoop):
@@ -62,8 +55,8 @@ class RolloutProgram:
             signals, self.choice = {**loop.signals}, loop.plant.dae.compiled
         else:
             self.diagram, self.name = loop, loop.get_name() or "the diagram"
-        diagram, leaves = self.diagram, Leaves.of(self.diagram)
-        self.context, self.laws = context or diagram.CreateDefaultContext(), laws_of(leaves.systems)
+        diagram, self.context = self.diagram, self.diagram.CreateDefaultContext()
+        self.laws = laws_of(Leaves.of(diagram).systems)
         for plant, law in self.laws.items() if like is not None else ():
             own = plant.GetMyMutableContextFromRoot(self.context).get_mutable_numeric_parameter(0)
             values = law.GetMyContextFromRoot(self.context).get_numeric_parameter(0).value()
@@ -77,8 +70,6 @@ class RolloutProgram:
         self.composed = composed = compose(
             diagram, self.ports, context=self.context, shares=like is not None
         )
-        inside = Leaves.of(self.drake).systems if isinstance(self.drake, Diagram) else [self.drake]
-        self.stepped = {name: cut for name, cut in composed.cuts.items() if cut[0] in inside}
         self.block = block = self._without_inputs()
         outputs = {each: block.outputs[each] for each in signals or self.ports}
         self.functions = StepFunctions(replace(block, outputs=outputs))
@@ -101,12 +92,11 @@ class RolloutProgram:
         drawn = [every[self.held_places[name]] for name in self.sources]
         self.drawn_places = np.concatenate([every[:0], *drawn])
         self.kept_places = np.setdiff1d(every, self.drawn_places)
-        self.columns: np.ndarray | None = None
         if like is not None:
-            places, total = like.composed.parameters, like.functions.sizes[3]
-            own = [np.arange(total)[places[system]] for system in composed.parameters]
+            places, total = like.composed.parameters, np.arange(like.functions.sizes[3])
+            own = [total[places[system]] for system in composed.parameters]
             fixed = max((part.stop for part in places.values()), default=0)
-            self.columns = np.concatenate([*own, np.arange(fixed, total)])
+            self.columns = np.concatenate([*own, total[fixed:]])
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
         with MAKING:
@@ -114,39 +104,23 @@ class RolloutProgram:
                 self.made[name] = make()
             return self.made[name]
 
-    @property
-    def shared(self) -> "RolloutProgram":
-        """The program of runs in which each plant and the model of its law have equal numbers."""
-        if not self.laws:
-            return self
-        found: RolloutProgram = self.kept("shared", lambda: RolloutProgram(self.loop, like=self))
-        return found
-
-    def shares(self, parameters: FloatArray, count: int) -> np.ndarray:
-        """In which runs each plant and its law have equal numbers, shape (count,)."""
-        parts, equal = self.composed.parameters, np.full(len(parameters), bool(self.laws))
+    def for_numbers(self, problems: RunProblem) -> "tuple[RolloutProgram, RunProblem]":
+        """The program in which plants and their laws share numbers, if they do so in all runs."""
+        parts, parameters = self.composed.parameters, problems.parameters
         for plant, law in self.laws.items():
-            if plant not in parts:
-                continue
-            own = parameters[:, parts[plant]]
-            same = own == parameters[:, parts[law]][:, : own.shape[1]]
-            if isinstance(plant, ParameterizedSystem) and plant.exogenous_places:
-                same[:, plant.exogenous_places] |= plant.GetInputPort("exogenous").HasValue(
-                    plant.GetMyContextFromRoot(self.context)
-                )
-            equal &= same.all(axis=1)
-        return np.broadcast_to(equal, count)
-
-    def some(self, problems: RunProblem, indices: np.ndarray) -> RunProblem:
-        """Some runs, with the parameters of this program."""
-        parameters, noise = (
-            table if len(table) == 1 else table[indices]
-            for table in (problems.parameters, problems.noise)
-        )
-        if self.columns is not None:
-            parameters = np.ascontiguousarray(parameters[:, self.columns])
-        state, held = problems.state[indices], problems.held[indices]
-        return replace(problems, state=state, held=held, parameters=parameters, noise=noise)
+            own = parameters[:, parts.get(plant, slice(0, 0))]
+            differs = (own != parameters[:, parts[law]][:, : own.shape[1]]).any(axis=0)
+            if isinstance(plant, ParameterizedSystem) and plant.exogenous_places and differs.size:
+                context = plant.GetMyContextFromRoot(self.context)
+                if plant.GetInputPort("exogenous").HasValue(context):
+                    differs[plant.exogenous_places] = False
+            if differs.any():
+                return self, problems
+        if not self.laws:
+            return self, problems
+        shared = self.kept("shared", lambda: RolloutProgram(self.loop, like=self))
+        columns = np.ascontiguousarray(parameters[:, shared.columns])
+        return shared, replace(problems, parameters=columns)
 
     def machine_code(
         self, choice: Compiled, calls: float, is_all: bool, several: bool = False
@@ -166,23 +140,19 @@ class RolloutProgram:
     @property
     def drake_state(self) -> slice:
         """The place of the state of Drake's plant among the held values."""
-        size = self.drake.dae.num_states if self.drake is not None else 0
-        parts = [self.held_places[name] for name in self.stepped]
+        assert self.drake is not None
+        size, every = self.drake.dae.num_states, self.held_places
+        parts = [every[name] for name in self.composed.cuts if name not in self.sources]
         return next(part for part in parts if part.stop - part.start == size)
 
     def values_in(self, context: Context) -> tuple[FloatArray, FloatArray, FloatArray]:
         """State, held values and parameters in a context of the diagram."""
-        composed, functions = self.composed, self.functions
-        state, held = np.zeros(functions.size), np.zeros(functions.sizes[2])
-        for system, part in composed.states.items():
-            local = context_in(system, context)
-            state[part] = local.get_continuous_state_vector().CopyToVector()
-        for (system, i), (group, _) in composed.held.items():
-            local = context_in(system, context)
-            held[self.held_places[group]] = local.get_discrete_state(i).value()
+        composed, (x, groups) = self.composed, states_in(self.composed, context)
+        state, none = np.zeros(self.functions.size), np.zeros(0)
+        state[: x.size] = x
         for name, (system, i) in composed.cuts.items():
-            value = system.get_output_port(i).Eval(context_in(system, context))
-            held[self.held_places[name]] = value
+            groups[name] = system.get_output_port(i).Eval(context_in(system, context))
+        held = np.concatenate([none, *(groups[name] for name in self.block.held)])
         values = [parameters_in(composed, context)]
         for system, i in composed.fixed.values():
             port, local = system.get_input_port(i), context_in(system, context)
@@ -203,20 +173,15 @@ class RolloutProgram:
         parameters: FloatArray,
     ) -> None:
         """Sets time, states and parameters in a context of the diagram."""
-        composed = self.composed
+        composed, first = self.composed, 0
         context.SetTime(time)
-        for system, part in composed.states.items():
-            system.GetMyMutableContextFromRoot(context).SetContinuousState(state[part])
-        for (system, i), (group, _) in composed.held.items():
+        put_states(composed, context, state, {n: held[p] for n, p in self.held_places.items()})
+        for system in composed.parameters:
             local = system.GetMyMutableContextFromRoot(context)
-            local.SetDiscreteState(i, held[self.held_places[group]])
-        for system, part in composed.parameters.items():
-            local, first = system.GetMyMutableContextFromRoot(context), part.start
             for i in range(local.num_numeric_parameter_groups()):
                 group = local.get_mutable_numeric_parameter(i)
                 group.SetFromVector(parameters[first : first + group.size()])
                 first += group.size()
-        first = sum(part.stop - part.start for part in composed.parameters.values())
         for system, i in composed.fixed.values():
             port, local = system.get_input_port(i), system.GetMyMutableContextFromRoot(context)
             port.FixValue(local, parameters[first : first + port.size()])
@@ -239,29 +204,22 @@ class RolloutProgram:
         events, due = events_within(rates, times, with_end=not self.is_discrete)
         if parameters is None:
             parameters = self.values_in(self.context)[2]
-        if seeds is not None:
-            seeds = [int(seed) if isinstance(seed, Integral) else seed for seed in seeds]
+        seeds = None if seeds is None else list(seeds)
         states = _table("starts", starts, self.num_states + self.kept_places.size)
         rows = _table("parameters", parameters, functions.sizes[3])
         count = max(len(states), len(rows), len(seeds or ()))
         if len(states) == 1:
             states = np.repeat(states, count, axis=0)
         count = len(states)
-        if len(rows) not in (1, count):
-            raise ModelError(f"{len(rows)} rows of parameters for {count} starts")
-        if seeds is not None and len(seeds) != count:
-            raise ModelError(f"{len(seeds)} seeds for {count} starts")
-        for seed in seeds or ():
-            for value in [seed] if isinstance(seed, int) else seed.values():
-                if not 0 <= value < 2**32:
-                    raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(value)}")
+        for what, given in (("rows of parameters", rows), ("seeds", seeds)):
+            if given is not None and len(given) != count and (what == "seeds" or len(given) > 1):
+                raise ModelError(f"{len(given)} {what} for {count} starts")
         # Without noise, or without seeds, it is the same in all runs.
-        different: Sequence[Seed | None] = seeds if seeds and self.sources else [None]
-        noise = np.array([self._noise(times[0], events, due, seed) for seed in different])
+        different = [self.seeds(seed) for seed in seeds or ()] if self.sources else []
+        noise = np.array([self._noise(times[0], events, due, seed) for seed in different or [{}]])
         held = np.zeros((count, functions.sizes[2]))
         held[:, self.kept_places] = states[:, self.num_states :]
-        if self.sources:
-            held[:, self.drawn_places] = noise[:, 0]
+        held[:, self.drawn_places] = noise[:, 0]
         state = np.zeros((count, functions.size))
         state[:, : self.num_states] = states[:, : self.num_states]
         rows, noise = np.ascontiguousarray(rows), np.ascontiguousarray(noise[:, 1:])
@@ -269,52 +227,59 @@ class RolloutProgram:
         self._check_starts(problems)
         return problems
 
+    def seeds(self, seed: Seed | None) -> dict[str, int]:
+        """Name of a source -> its seed in a run, of those that have one."""
+        named = {each: source.get_name() for each, source in self.sources.items()}
+        if isinstance(seed, Mapping):
+            found = {each: seed[name] for each, name in named.items() if name in seed}
+        else:
+            found = {} if seed is None else dict.fromkeys(named, seed)
+        for value in found.values():
+            if not 0 <= value < 2**32:
+                raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(value)}")
+        shift = 0 if isinstance(seed, Mapping) else 2**31  # Sources have numbers of their own.
+        places = {each: shift * k for k, each in enumerate(named)}
+        return {each: (int(value) + places[each]) % 2**32 for each, value in found.items()}
+
     def _noise(
-        self, start: float, events: FloatArray, due: np.ndarray, seed: Seed | None
+        self, start: float, events: FloatArray, due: np.ndarray, seeds: Mapping[str, int]
     ) -> FloatArray:
         """The numbers of all sources at the start and at each event, shape (k + 1, q)."""
         columns = [np.zeros((events.size + 1, 0))]
-        for number, (name, source) in enumerate(self.sources.items()):
+        for name, source in self.sources.items():
             place = self.held_places[name]
             (i,) = (i for i, r in enumerate(self.functions.rates) if place.start in r.places)
             rows, period = np.flatnonzero(due >> i & 1), self.functions.rates[i].period
-            chosen = self.seed_of(seed, number)
             drawn = np.zeros((events.size + 1, place.stop - place.start))
-            drawn[[0, *(rows + 1)]] = drawn_noise(source, start, events[rows], period, chosen)
+            numbers = drawn_noise(source, start, events[rows], period, seeds.get(name))
+            drawn[[0, *(rows + 1)]] = numbers
             columns.append(drawn)
         return np.concatenate(columns, axis=1)
-
-    def seed_of(self, seed: Seed | None, number: int) -> int | None:
-        """The seed of one of the sources."""
-        if isinstance(seed, Mapping):
-            return seed.get([*self.sources.values()][number].get_name())
-        return None if seed is None else (int(seed) + number * 2**31) % 2**32
 
     def _check_starts(self, problems: RunProblem) -> None:
         """Refuses starts that are off N*."""
         context, time, parts = self.context.Clone(), float(problems.times[0]), self.composed
         for plant in (s for s in parts.states if isinstance(s, DaePlant)):
-            local, part = plant.GetMyContextFromRoot(context), parts.states[plant]
             own = parts.parameters.get(plant, slice(0, 0))
-            for i in range(len(problems.state)):
-                one = problems.run(i)
+            for one in map(problems.run, range(len(problems.state))):
                 values = one.parameters[own]
                 if plant.exogenous_places:
                     self.put(context, time, one.state, one.held, one.parameters)
-                    values = plant.current_parameters(local)
-                plant.check_start(one.state[part], values)
+                    values = plant.current_parameters(plant.GetMyContextFromRoot(context))
+                plant.check_start(one.state[parts.states[plant]], values)
 
     def _without_inputs(self) -> Block:
         """The block with "noise" as its input alone; others are parameters, or held if Drake's."""
-        composed, block = self.composed, self.composed.block
+        composed, block, drake = self.composed, self.composed.block, self.drake
+        inside = Leaves.of(drake).systems if isinstance(drake, Diagram) else [drake]
         noise, random, stepped = list[ca.SX](), dict[str, Held](), dict[str, Held]()
         for name, (system, index) in composed.cuts.items():
             symbol, start = block.inputs[name], np.zeros(block.inputs[name].numel())
             if isinstance(system, RandomSource):
                 noise.append(ca.SX.sym(name, symbol.numel()))
                 random[name] = Held(symbol, noise[-1], start, source_period(system))
-            elif self.drake is not None and name in self.stepped:
-                stepped[name] = Held(symbol, symbol, start, self.drake.time_step)
+            elif drake is not None and system in inside:
+                stepped[name] = Held(symbol, symbol, start, drake.time_step)
             else:
                 port = system.get_output_port(index).get_name()
                 raise ModelError(
@@ -397,45 +362,32 @@ def events_within(
 
 def source_period(source: RandomSource) -> float:
     """The time between two draws in s, which is the time of the first event after t = 0."""
-    simulator, times = Simulator(source), list[float]()
-
-    def stop(context: Context) -> EventStatus:
-        times.append(context.get_time())
-        if len(times) < 3:
-            return EventStatus.DidNothing()
-        return EventStatus.ReachedTermination(source, "seen")
-
-    simulator.set_monitor(stop)
+    simulator = Simulator(source)
+    simulator.Initialize()
+    simulator.set_monitor(lambda context: EventStatus.ReachedTermination(source, "an event"))
     simulator.AdvanceTo(1e9)
-    return next(time for time in times if time > 0.0)
+    return float(simulator.get_context().get_time())
 
 
 def drawn_noise(
     source: RandomSource, start: float, times: FloatArray, period: float, seed: int | None
 ) -> FloatArray:
     """The output of Drake's source at the start and after each of its updates; shape (k + 1, q)."""
-    context = source.CreateDefaultContext()
+    builder = DiagramBuilder()
+    copy = builder.AddSystem(source.Clone())
+    logger = LogVectorOutput(copy.get_output_port(), builder)
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = copy.GetMyMutableContextFromRoot(context)
+    if seed is None:  # The default of a source differs from that of its copy.
+        own.SetStateAndParametersFrom(source.CreateDefaultContext())
+    else:
+        copy.SetRandomContext(own, RandomGenerator(seed))
     context.SetTime(start)
-    if seed is not None:
-        source.SetRandomContext(context, RandomGenerator(seed))
-    simulator, port = Simulator(source, context), source.get_output_port()
-    values = [port.Eval(context).copy()]
-    if seed is not None:
-        # A source with more outputs draws all numbers at once. Drake does not return the
-        # distribution of a source, so that its first numbers decide.
-        for distribution in RandomDistribution.__members__.values():
-            if (_first(distribution, values[0].size, seed) == values[0]).all():
-                numbers = _first(distribution, values[0].size * (times.size + 1), seed)
-                return numbers.reshape(times.size + 1, -1)
-    for moment in times:
-        simulator.AdvanceTo(moment + 0.5 * period)
-        values.append(port.Eval(context).copy())
-    return np.array(values)
-
-
-def _first(distribution: RandomDistribution, size: int, seed: int) -> FloatArray:
-    """The numbers with which a source of this size starts."""
-    source = RandomSource(distribution, size, 1.0)
-    context = source.AllocateContext()
-    source.SetRandomContext(context, RandomGenerator(seed))
-    return source.get_output_port().Eval(context)
+    simulator = Simulator(diagram, context)
+    simulator.Initialize()
+    simulator.AdvanceTo((times[-1] if times.size else start) + 0.5 * period)
+    log = logger.FindLog(context)
+    # A step ends before the updates of its time.
+    after = np.searchsorted(log.sample_times(), times + 1e-3 * period)
+    return np.vstack([log.data()[:, :1].T, log.data()[:, after].T])

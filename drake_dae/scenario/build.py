@@ -34,7 +34,7 @@ from drake_dae.pictures.page_controls import PUSH
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import KnownWrench, Load, PointOnSurface, RobotModel, ScaledForce
 from drake_dae.running.diagnosis import DivergenceWatch
-from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
+from drake_dae.running.rollout import Rollout, run_loop, start_values
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
 from drake_dae.scenario.gains import advised, estimates_all, estimating_all, estimating_friction
@@ -367,17 +367,17 @@ def roll_scenario(
         seeds["force_noise"] = sensors.force.seed
     if sensors.encoders is not None:
         seeds[parts.ENCODER_NOISE] = parts.encoder_seed(sensors.encoders.seed)
-    watch, due = DivergenceWatch(loop.plant, scenario.duration), time.perf_counter() + PERIOD
+    watch, due = DivergenceWatch(loop.plant), time.perf_counter() + PERIOD
     seen: float | None = None
     failure: SimulationError | None = None
 
-    def diverges(rows: Record, is_last: bool = False) -> bool:
+    def diverges(rows: Record) -> bool:
         nonlocal seen, due, failure
         due = time.perf_counter() + PERIOD
         if not scenario.judgement.may_diverge and failure is None and rows.time.size:
             seen = float(rows.time[-1])
             try:
-                watch.look(rows, is_last=is_last)
+                watch.look(rows)
             except SimulationError as error:
                 failure = error
         return failure is not None
@@ -388,10 +388,10 @@ def roll_scenario(
     times = rollout_times(scenario, loop.plant.time_step)
     more: dict[str, Any] = {"config": scenario.integrator, "seeds": [seeds], "lasting": lasting}
     (rollout,) = run_loop(loop, start, parameters, times, look=watched, **more)
-    if diverges(rollout.record.after(seen), is_last=rollout.failure is None):
+    if diverges(rollout.record.after(seen)):
         assert failure is not None
         rollout = rollout.ended(failure)
-    return diagnosed(loop, rollout, scenario.integrator)
+    return rollout
 
 
 class Commanded(NamedTuple):

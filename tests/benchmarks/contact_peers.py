@@ -22,14 +22,20 @@ from pydrake.math import VectorToSkewSymmetric
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Diagram, DiagramBuilder, EventStatus, LeafSystem, TriggerType
+from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem, TriggerType
 from pydrake.systems.primitives import Adder, LogVectorOutput, MatrixGain, RandomSource
 from scipy.linalg import eigh
 
-from drake_dae import ContactPlant, Encoders, ReferenceGenerator, load_scenario, simulate
+from drake_dae import (
+    ContactPlant,
+    Encoders,
+    ForceSensor,
+    ReferenceGenerator,
+    load_scenario,
+    simulate,
+)
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import DrakeDaeError
-from drake_dae.scenario import parts
 from drake_dae.scenario.build import build_completed, make_plant
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, scenario_structure
@@ -47,24 +53,20 @@ STEPS = SimulatorConfig(
 
 
 class Condition(NamedTuple):
-    """A plant: its scenario, what it has otherwise, a load in kg, and whether there is noise."""
+    """A plant: its scenario, and what it has otherwise."""
 
     title: str
+    setting: str = "plant.stiffness=1e5"
     scenario: str = "wall_point_contact"
-    settings: tuple[str, ...] = ("plant.stiffness=1e5",)
-    load: float = 0.0
     noise: float = 0.0
 
 
 CONDITIONS = (
     Condition("point 1e5 N/m"),
-    Condition("point 1e6 N/m", settings=("plant.stiffness=1e6",)),
-    Condition("hydro 1e8 Pa", "wall_hydroelastic", ("plant.modulus=1e8",)),
-    Condition(
-        "wall +2 mm",
-        settings=("plant.stiffness=1e5", "plant.parameters={wall.position: [0.702, 0, 0]}"),
-    ),
-    Condition("tool +0.5 kg", load=0.5),
+    Condition("point 1e6 N/m", "plant.stiffness=1e6"),
+    Condition("hydro 1e8 Pa", "plant.modulus=1e8", "wall_hydroelastic"),
+    Condition("wall +2 mm", "plant.parameters={wall.position: [0.702, 0, 0]}"),
+    Condition("tool +0.5 kg", "plant.payloads=[{frame: tool, mass: 0.5}]"),
     Condition("noise", noise=1.0),
 )
 
@@ -270,63 +272,24 @@ RIVALS = {
 OURS = "drake_dae, as shipped"
 
 
-class MeasuredPlant(ContactPlant):
-    """Drake's contact, whose port `state` has the noise of encoders; `link_state` has none."""
-
-    def __init__(self, plant: ContactPlant, noise: float) -> None:
-        Diagram.__init__(self)
-        self.__dict__.update({k: one for k, one in vars(plant).items() if "pydrake" not in k})
-        builder = DiagramBuilder()
-        builder.AddSystem(plant)
-        self._noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 14, PERIOD))
-        deviations = noise * np.repeat([ANGLE_NOISE, RATE_NOISE], 7)
-        scaled = builder.AddSystem(MatrixGain(np.diag(deviations)))
-        measured = builder.AddSystem(Adder(2, 14))
-        builder.Connect(self._noise.get_output_port(), scaled.get_input_port())
-        builder.Connect(plant.GetOutputPort("state"), measured.get_input_port(0))
-        builder.Connect(scaled.get_output_port(), measured.get_input_port(1))
-        builder.ExportInput(plant.GetInputPort("control"), "control")
-        builder.ExportOutput(measured.get_output_port(), "state")
-        for index in range(plant.num_output_ports()):
-            if (port := plant.get_output_port(index)).get_name() != "state":
-                builder.ExportOutput(port, port.get_name())
-        builder.BuildInto(self)
-        self.set_name(plant.get_name())
-
-    def vary(self, context, load: float) -> None:
-        """Puts the load and a seed into a root context."""
-        body = self.multibody.GetBodyByName("tool")
-        own = self.multibody.GetMyMutableContextFromRoot(context)
-        body.SetMass(own, body.get_mass(own) + load)
-        noise = self._noise.GetMyMutableContextFromRoot(context)
-        self._noise.SetRandomContext(noise, RandomGenerator(1))
-
-
-class _Measured(parts.MultibodyPlant):
-    """The plant of a scenario, as a `MeasuredPlant`."""
-
-    def plant(self, *robot):
-        return MeasuredPlant(super().plant(*robot), 0.0)
-
-
 @cache
 def ours(condition: Condition, friction: float):
+    """The loop as shipped, its start, and the scenario with the gains that it computes."""
     sensor = f"{{sample_period: {PERIOD}, noise_deviation: {FORCE_NOISE * condition.noise}}}"
     settings = [
         f"plant.friction={FRICTION}",
         f"constraints.0.friction={friction}",
         f"sensors.force={sensor}",
         f"duration={DURATION}",
-        *condition.settings,
     ]
-    given = load_scenario(condition.scenario, settings)
+    settings += ["plant.stiffness=1e5"] * (condition.scenario == "wall_point_contact")
+    given = load_scenario(condition.scenario, [*settings, condition.setting])
     model = completed_model(given)[1]
     scenario = advised(given, model, scenario_structure(model)).scenario
     if condition.noise:  # Its gains are those for sensors without noise.
         noisy = Encoders(position_noise=ANGLE_NOISE, velocity_noise=RATE_NOISE, seed=1)
         scenario = replace(scenario, sensors=replace(scenario.sensors, encoders=noisy))
-    measured = _Measured(**vars(scenario.plant))
-    _, loop = build_completed(replace(scenario, plant=measured))
+    _, loop = build_completed(scenario)
     return loop, start_scenario(scenario, loop), scenario
 
 
@@ -338,13 +301,12 @@ def run(law: str, condition: Condition, friction: float) -> tuple[float, ...]:
         start = ours(CONDITIONS[0], 0.0)
         state = start[0].plant.state(start[0].plant.GetMyContextFromRoot(start[1]))
         known = Known(loop.plant.model.links.plant, state, friction)
-        bare = make_plant(scenario, loop.plant.model, loop.plant.structure)
-        plant = MeasuredPlant(bare, condition.noise)
+        plant = make_plant(scenario, loop.plant.model, loop.plant.structure)
         kind, text = RIVALS[law]
-        diagram, logs = wired(kind(known, gains(text)), plant, loop, scenario)
+        diagram, logs = wired(kind(known, gains(text)), plant, loop, scenario, condition.noise)
         own, config = diagram.CreateDefaultContext(), STEPS
+        diagram.SetRandomContext(own, RandomGenerator(1))
         plant.set_consistent_state(plant.GetMyMutableContextFromRoot(own), state)
-    (plant if law != OURS else loop.plant).vary(own, condition.load)
     try:
         simulate(diagram, own, DURATION, config)
     except (DrakeDaeError, RuntimeError):
@@ -364,20 +326,30 @@ def run(law: str, condition: Condition, friction: float) -> tuple[float, ...]:
     return 1e3 * position, force, rough, float(np.mean(z[late, -1] <= 0.0))
 
 
-def wired(law: Rival, plant: MeasuredPlant, loop, scenario):
+def wired(law: Rival, plant: ContactPlant, loop, scenario, noise: float):
+    """A rival on the plant, with the noise of encoders, and logs of outputs and controls."""
     builder = DiagramBuilder()
     degrees = (*loop.reference.degrees[:-1], 0)  # A rival knows no rate of the force.
     reference = ReferenceGenerator(loop.reference.references, degrees)
     hold = ControlHold(7, scenario.sampling)
-    sensor = scenario.sensors.force.sensor(1)
-    for system in (plant, law, reference, hold, sensor):
+    sensor = ForceSensor(1, sample_period=PERIOD, noise_deviation=noise * FORCE_NOISE)
+    deviations = noise * np.repeat([ANGLE_NOISE, RATE_NOISE], 7)
+    scaled, measured = MatrixGain(np.diag(deviations)), Adder(2, 14)
+    for system in (plant, law, reference, hold, sensor, scaled, measured):
         builder.AddSystem(system)
-    builder.Connect(plant.GetOutputPort("state"), law.GetInputPort("estimated_state"))
+
+    def add_noise(size: int, port) -> None:
+        noisy = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, size, PERIOD))
+        builder.Connect(noisy.get_output_port(), port)
+
+    add_noise(14, scaled.get_input_port())
+    builder.Connect(plant.GetOutputPort("state"), measured.get_input_port(0))
+    builder.Connect(scaled.get_output_port(), measured.get_input_port(1))
+    builder.Connect(measured.get_output_port(), law.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), law.GetInputPort("reference"))
     builder.Connect(plant.GetOutputPort("constraint_force"), sensor.GetInputPort("force"))
     if sensor.HasInputPort("noise"):
-        noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 1, PERIOD))
-        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+        add_noise(1, sensor.GetInputPort("noise"))
     builder.Connect(sensor.GetOutputPort("measured_force"), law.GetInputPort("measured_force"))
     builder.Connect(law.GetOutputPort("control"), hold.get_input_port())
     builder.Connect(hold.get_output_port(), plant.GetInputPort("control"))

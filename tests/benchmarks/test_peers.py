@@ -1,143 +1,122 @@
-"""The dynamics of constrained arms beside Pinocchio and MuJoCo: the same arm, the same constraint.
+"""The dynamics of constrained arms beside Pinocchio and MuJoCo, as the referee describes them.
 
-Accelerations are compared first: with Pinocchio's to 1e-9, with MuJoCo's without constraint to 1e-9
-and with it to 2e-3, since its constraints are soft and 0.9999 is the hardest that it takes. All are
-called from Python; less what a call takes there is what a program in C++ would see. Ours in C is a
-loop over 200 states in generated code. `mj_forward` also does what a robot without contact and
-sensors has little of. Of a peer that is not installed a line says so.
+Accelerations are compared first: with Pinocchio's to 1e-9, with MuJoCo's to 2e-3, since its
+constraints are soft and 0.9999 is the hardest that it takes. All are called from Python; less what
+a call takes there is what a program in C++ would see. Ours in C is a loop over 200 states in
+generated code. `mj_forward` also does what a robot without contact and sensors has little of. Of a
+peer that is not installed a line says so.
 """
+
+from importlib import import_module
 
 import numpy as np
 import pytest
-from arms import parse
 from numpy.testing import assert_allclose
-from peers import Tree, mujoco_model, pinocchio_model, se3
-from pydrake.math import RigidTransform
+from referee.description import Body, Closure, Mechanism, Y, Z
+from referee.engines.ours import model_of
+from referee.tree import controls
 from timing import calls, times
-from two_arms import GRASP, two_arms
 
-from drake_dae import CoincidentPoints, DaePlant, JointPositions, RobotModel
+from drake_dae import DaePlant
 from drake_dae.systems.ideal_plants import dae_block
 from drake_dae.trace.functions import TracedFunction
 
-HELD = np.array([0.0, -0.1938, 0.0, -1.936, 0.0, 0.559, 0.0])
+LENGTHS, MASSES = (0.3, 0.3, 0.3, 0.3, 0.2, 0.2, 0.1), (4.0, 4.0, 3.0, 2.7, 1.7, 1.6, 0.4)
 
 
-def pinned() -> RobotModel:
-    """The seven-joint arm, its tool held at a point of the world by a ball joint."""
-    plant = parse("seven_joint_arm")
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, HELD)
-    point = plant.GetFrameByName("tool").CalcPoseInWorld(context).translation()
-    pin = CoincidentPoints("world", point, "tool", np.zeros(3))
-    outputs = [JointPositions(["joint1", "joint3", "joint5", "joint7"])]
-    return RobotModel.from_multibody(plant, [pin], outputs, HELD, "pinned")
-
-
-def ends(name: str, tree: Tree, model: RobotModel):
-    """The frames that the constraint holds together: joint and pose of both."""
-    if name == "7 joints, tool on a point":
-        point = model.constraints[0].point_a
-        return tree.place("tool"), (-1, RigidTransform(point))
-    return tree.place("object", GRASP.pose), tree.place("right::tool")
-
-
-def pinocchio_calls(name, tree, model, q, v, u, wanted):
-    """`constraintDynamics`, and the same of a joint alone: what a call from Python takes."""
-    import pinocchio
-
-    robot = pinocchio_model(tree)
-    (one, there), (other, here) = ends(name, tree, model)
-    kind = pinocchio.ContactType
-    held = pinocchio.RigidConstraintModel(
-        kind.CONTACT_3D if name.startswith("7") else kind.CONTACT_6D,
-        robot,
-        one + 1,
-        se3(there),
-        other + 1,
-        se3(here),
-        pinocchio.ReferenceFrame.LOCAL,
+def arm(name: str, base: float) -> tuple[Body, ...]:
+    """Seven links in a row, none of them symmetric, that turn about z and y."""
+    return tuple(
+        Body(
+            f"{name}{i}",
+            (("turn", (Z, Y)[i % 2]),),
+            f"{name}{i - 1}" if i else "world",
+            (0.01, -0.02, LENGTHS[i - 1]) if i else (base, 0.0, 0.1),
+            MASSES[i],
+            (0.02, -0.01, LENGTHS[i] / 2),
+            (0.01 * MASSES[i], 0.012 * MASSES[i], 0.004 * MASSES[i]),
+        )
+        for i in range(7)
     )
-    lone = pinocchio.Model()
-    lone.addJoint(0, pinocchio.JointModelRZ(), pinocchio.SE3.Identity(), "lone")
-    lone.appendBodyToJoint(1, pinocchio.Inertia.Random(), pinocchio.SE3.Identity())
-
-    def call(robot, constraints, *given):
-        data, settings = robot.createData(), pinocchio.ProximalSettings(1e-12, 0.0, 1)
-        contacts = pinocchio.StdVec_RigidConstraintModel()
-        for constraint in constraints:
-            contacts.append(constraint)
-        rooms = pinocchio.StdVec_RigidConstraintData()
-        for constraint in constraints:
-            rooms.append(constraint.createData())
-        pinocchio.initConstraintDynamics(robot, data, contacts, rooms)
-        dynamics = pinocchio.constraintDynamics
-        return lambda: dynamics(robot, data, *given, contacts, rooms, settings)
-
-    whole = call(robot, [held], q, v, u)
-    assert_allclose(whole(), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
-    return whole, call(lone, [], *np.zeros((3, 1)))
 
 
-def mujoco_calls(name, tree, model, q, v, u, wanted):
-    """`mj_forward`, and a call that does next to nothing."""
-    import mujoco
+END = (0.0, 0.0, LENGTHS[-1])
+CASES = {
+    "7 joints, tool on a point": Mechanism(
+        "one",
+        arm("link", 0.0),
+        (Closure("pin", "point", "world", (0.6, 0.0, 0.6), "link6", END),),
+        q=(0.1, 0.2, -0.1, 1.6, 0.2, 0.6, 0.1),
+        free=(),
+        torques=dict.fromkeys(range(7), 1.0),
+    ),
+    "14 joints, welded into a loop": Mechanism(
+        "two",
+        (*arm("left", 0.0), *arm("right", 1.486)),
+        (Closure("grip", "weld", "left6", END, "right6", END),),
+        q=(0.0, 0.3, 0.0, 1.0, 0.0, 0.3, 0.0, 0.0, -1.0, 0.0, 0.3, 0.0, 2.3, 0.0),
+        free=(),
+        torques=dict.fromkeys(range(14), 1.0),
+    ),
+}
 
-    kind = "connect" if name.startswith("7") else "weld"
-    hard = 'solimp="0.9999 0.9999 0.001 0.5 2"'
-    equality = f'<{kind} site1="site0" site2="site1" {hard}/>'
-    robot = mujoco_model(tree, equality, *ends(name, tree, model))
-    data = mujoco.MjData(robot)
-    data.qpos[:], data.qvel[:], data.qfrc_applied[:] = q, v, u
-    mujoco.mj_forward(robot, data)
-    plant, context = tree.plant, tree.plant.CreateDefaultContext()
-    plant.SetPositions(context, q)
-    plant.SetVelocities(context, v)
-    bias = plant.CalcBiasTerm(context) - plant.CalcGravityGeneralizedForces(context)
-    free = np.linalg.solve(plant.CalcMassMatrix(context), u - bias)
-    assert_allclose(data.qacc_smooth, free, rtol=1e-9, atol=1e-9 * np.abs(free).max())
+
+def pinocchio_calls(mechanism, q, v, wanted):
+    """`constraintDynamics`, and the same of a joint alone: what a call from Python takes."""
+    engine, once = import_module("referee.engines.pinocchio_engine"), (1e-12, 0.0, 1)
+    whole, _, places = engine.solver(mechanism, q, v, once)
+    assert_allclose(whole()[places], wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+    lone = Mechanism("lone", (Body("lone"),), (), (0.0,), (0,))
+    return whole, engine.solver(lone, np.zeros(1), np.zeros(1), once)[0]
+
+
+def mujoco_calls(mechanism, q, v, wanted):
+    """`mj_forward` with MuJoCo's own settings, and a call that does next to nothing."""
+    mujoco = import_module("mujoco")
+    model, data = import_module("referee.engines.mujoco_engine").solved(mechanism, q, v, {})
+    options, switch = model.opt, mujoco.mjtDisableBit
+    options.tolerance, options.iterations = 1e-8, 100
+    options.ls_tolerance, options.ls_iterations = 0.01, 50
+    options.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    options.disableflags |= switch.mjDSBL_CONTACT | switch.mjDSBL_LIMIT | switch.mjDSBL_ISLAND
+    mujoco.mj_forward(model, data)
     assert_allclose(data.qacc, wanted, atol=2e-3 * np.abs(wanted).max())
-    return lambda: mujoco.mj_forward(robot, data), lambda: mujoco.mj_isSparse(robot)
-
-
-def dynamics_of(plant: DaePlant, compiled: bool) -> TracedFunction:
-    """(x, u, parameters) -> x' of the ideal plant."""
-    block = dae_block(plant.structure, project=False)
-    inputs = {"x": block.state, "u": block.inputs["control"], "p": block.parameters}
-    return TracedFunction("dynamics", inputs, {"rate": block.derivative}, compiled=compiled)
+    return lambda: mujoco.mj_forward(model, data), lambda: mujoco.mj_isSparse(model)
 
 
 PEERS = {"Pinocchio": pinocchio_calls, "MuJoCo": mujoco_calls}
 
 
-@pytest.mark.parametrize("name", ["7 joints, tool on a point", "14 joints, welded into a loop"])
+@pytest.mark.parametrize("name", CASES)
 def test_dynamics(name, compare):
-    model = pinned() if name.startswith("7") else two_arms()
-    plant, random = DaePlant(model.dae), np.random.default_rng(0)
-    dynamics = [dynamics_of(plant, compiled) for compiled in (False, True)]
-    nominal = model.dae.nominal_state
+    mechanism = CASES[name]
+    plant, random = DaePlant(model_of(mechanism).dae), np.random.default_rng(0)
+    block = dae_block(plant.structure, project=False)
+    inputs = {"x": block.state, "u": block.inputs["control"], "p": block.parameters}
+    dynamics = [
+        TracedFunction("dynamics", inputs, {"rate": block.derivative}, compiled=compiled)
+        for compiled in (False, True)
+    ]
+    nominal = plant.dae.nominal_state
     state = plant.structure.manifold.project(nominal + 0.1 * random.normal(size=nominal.size))
     q, v = np.split(state, 2)
-    u, p = random.normal(size=q.size), model.dae.parameter_values
-    wanted = dynamics[0](state, u, p)[0][q.size :]
-    functions = calls(dynamics, state, u, p)
-    ours, missing = list(functions), []
+    given = state, np.array(controls(mechanism)), plant.dae.parameter_values
+    wanted = dynamics[0](*given)[0][q.size :]
+    functions = calls(dynamics, *given)
+    ours = list(functions)
     for peer, make in PEERS.items():
         try:
-            both = make(name, Tree(model.links.plant), model, q, v, u, wanted)
-        except ModuleNotFoundError:
-            missing.append(peer)
+            both = make(mechanism, q, v, wanted)
+        except ImportError:
+            compare(f"dynamics, {name}", 0.0, f"{peer} is missing, see [benchmark]")
         else:
             functions |= dict(zip((peer, f"{peer}, nothing"), both, strict=True))
     took = times(functions)
-    for peer in PEERS:
-        if peer in missing:
-            compare(f"dynamics, {name}", took[ours[-1]], f"{peer} is missing, see [benchmark]")
-            continue
+    for peer in (peer for peer in PEERS if peer in took):
         for how in ours:
             # What a loop in C computes stands beside what a call takes less its way from Python.
             in_c = how == "in C"
             other = took[peer] - took[f"{peer}, nothing"] * in_c
-            wanted_ratio = "" if how == "interpreted" else 1.0
             label = f"{peer} less its call" if in_c else f"{peer} from Python"
+            wanted_ratio = "" if how == "interpreted" else 1.0
             compare(f"dynamics, {name}: {how}", took[how], label, other, wanted_ratio)

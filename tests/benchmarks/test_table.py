@@ -11,14 +11,10 @@ import time
 
 import numpy as np
 import pytest
-from empty import empty_loop, stepping
 from pydrake.geometry import SceneGraph
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import TrajectorySource
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 from runs import scenario
 from timing import calls, has_compiler, race, times
@@ -27,10 +23,6 @@ from two_arms import two_arms
 from drake_dae import (
     DcMotors,
     FlexibleJoints,
-    JointPositions,
-    Plane,
-    PointOnSurface,
-    RobotModel,
     RobotPlant,
     TrackingLaw,
     build_scenario,
@@ -56,19 +48,14 @@ FIXED = [
 CONTACT = 2.0
 """The simulated time of a run on contact in s, and half of that of a longer one."""
 
-CHOICES = {"interpreted": "false", "machine code": "true"}
+CHOICES = {"interpreted": "false"} | ({"machine code": "true"} if has_compiler() else {})
+"""How functions run, and the choice of a scenario that makes them so."""
 
 
-def choices() -> dict[str, str]:
-    """How functions run, and the choice of a scenario that makes them so."""
-    return {name: text for name, text in CHOICES.items() if text == "false" or has_compiler()}
-
-
-def loops(name: str, *settings: str):
-    """A scenario for each choice: how it runs, the scenario, its loop, and its start."""
-    for how, compiled in choices().items():
-        chosen = scenario(name, *settings, f"compiled={compiled}")
-        yield how, chosen, *build_scenario(chosen)
+def loops(name: str):
+    """A scenario for each choice: how it runs, its loop, and its start."""
+    for how, compiled in CHOICES.items():
+        yield how, *build_scenario(scenario(name, f"compiled={compiled}"))
 
 
 LAWS = {
@@ -81,7 +68,7 @@ LAWS = {
 
 @pytest.mark.parametrize("label", LAWS)
 def test_law(label, compare):
-    laws = [loop.controller.law for _, _, loop, _ in loops(LAWS[label])]
+    laws = [loop.controller.law for _, loop, _ in loops(LAWS[label])]
     law, state = laws[0], laws[0].system.nominal_state
     reference = np.linspace(0.1, 0.5, len(law.reference_signals))
     functions = [one.function for one in (laws * 2)[:2]]
@@ -94,9 +81,45 @@ def test_law(label, compare):
         compare(f"law, {label}: {how}", took[how], "interpreted", took["interpreted"])
 
 
+class Empty(LeafSystem):
+    """A block that computes nothing: what Drake itself takes."""
+
+    def __init__(self, states, inputs, outputs):
+        super().__init__()
+        index = self.DeclareContinuousState(states)
+        self.inputs = [self.DeclareVectorInputPort(name, size) for name, size in inputs.items()]
+        self.value = np.zeros(outputs)
+        self.DeclareStateOutputPort("state", index)
+        self.DeclareVectorOutputPort("control", outputs, self.calc)
+
+    def calc(self, context, output):
+        for port in self.inputs:
+            port.Eval(context)
+        output.SetFromVector(self.value)
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        if derivatives.size():
+            self.inputs[0].Eval(context)
+            state = context.get_continuous_state_vector().CopyToVector()
+            derivatives.get_mutable_vector().SetFromVector(state)
+
+
+def empty_loop(states, references, controls):
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(Empty(states, {"control": controls}, 0))
+    law = {"estimated_state": states, "reference": references}
+    controller = builder.AddSystem(Empty(0, law, controls))
+    source = builder.AddSystem(ConstantVectorSource(np.zeros(references)))
+    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
+    builder.Connect(source.get_output_port(), controller.GetInputPort("reference"))
+    builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
+    diagram = builder.Build()
+    return diagram, diagram.CreateDefaultContext()
+
+
 def test_closed_loop(compare):
     """In Drake: a derivative at a new state, and a step of 1 ms with its projection."""
-    for how, _, loop, context in loops("seven_joint_wall"):
+    for how, loop, context in loops("seven_joint_wall"):
         law = loop.controller.law
         sizes = law.system.num_states, len(law.reference_signals), law.system.num_controls
         # The loop as wired, and as one block, which `simulate` runs.
@@ -129,10 +152,21 @@ def test_closed_loop(compare):
             figure = f"derivative of the closed loop, 7 joints, {name}: {how}"
             wanted = 1.0 if (name, how) == ("as one block", "machine code") else ""
             compare(figure, alone[name], "empty blocks", alone["empty"], wanted)
-        runs = [stepping(block, block.CreateDefaultContext()), stepping(*pairs["empty"])]
-        found = np.array([[run() for run in runs] for _ in range(30)]).min(axis=0) * 1e-6
+        steps = {}
+        for name in ("as one block", "empty"):
+            config = SimulatorConfig(
+                integration_scheme="runge_kutta3", use_error_control=False, max_step_size=1e-3
+            )
+            simulator = Simulator(*pairs[name])
+            ApplySimulatorConfig(config, simulator)
+            simulator.Initialize()
+            at = simulator.get_context()
+            steps[name] = lambda simulator=simulator, at=at: simulator.AdvanceTo(
+                at.get_time() + 1e-3
+            )
+        found = race(steps, rounds=30)
         figure = f"1 ms step of the block, RK3, projected: {how}"
-        compare(figure, found[0], "empty blocks", found[1])
+        compare(figure, found["as one block"], "empty blocks", found["empty"])
 
 
 @pytest.mark.parametrize("case", ["1 ms steps", "accuracy 1e-8"])
@@ -152,17 +186,11 @@ def test_rollout(case, compare):
         ends["simulate"] = loop.record(own)["state"][-1]
 
     def rolled(how):
-        (done,) = rollout(
-            loop,
-            start,
-            parameters,
-            moments,
-            config=chosen.integrator,
-            compiled=how != "interpreted",
-        )
+        options = {"config": chosen.integrator, "compiled": how != "interpreted"}
+        (done,) = rollout(loop, start, parameters, moments, **options)
         ends[how] = done.record["state"][-1]
 
-    own = {how: lambda how=how: rolled(how) for how in choices()}
+    own = {how: lambda how=how: rolled(how) for how in CHOICES}
     for function in own.values():
         function()  # The first compiles.
     took = race({"simulate": drake, **own}, rounds=3, number=1)
@@ -172,47 +200,16 @@ def test_rollout(case, compare):
         compare(figure, took[how], "simulate", took["simulate"])
 
 
-def arms_with_motors() -> RobotModel:
-    """14 joints with springs and motors, and a weld."""
-    return two_arms([SPRINGS, MOTORS])
-
-
-def flexible_snake() -> RobotModel:
-    """30 joints with springs, the last link on a floor."""
-    plant = MultibodyPlant(0.0)
-    inertia = SpatialInertia(1.0, [0.05, 0.0, 0.0], UnitInertia(0.02, 0.02, 0.02))
-    end = plant.world_frame()
-    for i in range(30):
-        body = plant.AddRigidBody(f"link{i}", inertia)
-        joint = RevoluteJoint(f"j{i}", end, body.body_frame(), np.eye(3)[2 - i % 3])
-        plant.AddJointActuator(f"motor{i}", plant.AddJoint(joint))
-        pose = RigidTransform([0.1, 0.0, 0.0])
-        end = plant.AddFrame(FixedOffsetFrame(f"end{i}", body.body_frame(), pose))
-    plant.Finalize()
-    floor = PointOnSurface("link29", Plane([0.0, 0.0, -1.0], [0.0, 0.0, 1.0]))
-    outputs = [JointPositions([f"j{i}" for i in range(30) if i != 26])]
-    bent = 0.3 * np.sin(np.arange(30))
-    return RobotModel.from_multibody(plant, [floor], outputs, bent, "snake", [SPRINGS])
-
-
-TRACED = {
-    "14 joints with springs and motors": (arms_with_motors, 5.0),
-    "30 joints with springs": (flexible_snake, 8.0),
-}
-
-
-@pytest.mark.parametrize("label", TRACED)
-def test_tracing(label, compare):
+def test_tracing(compare):
     """Model with its comparison to the plant, structure, law and plant; nothing is compiled."""
-    make, wanted = TRACED[label]
     seconds = []
     for _ in range(2):
         began = time.process_time()
-        model = make()
+        model = two_arms([SPRINGS, MOTORS])
         law = TrackingLaw(model.dae, poles(-4.0))
         RobotPlant(model, structure=law.structure)
         seconds.append(time.process_time() - began)
-    compare(f"tracing, {label}", min(seconds), wanted=wanted)
+    compare("tracing, 14 joints with springs and motors", min(seconds), wanted=5.0)
 
 
 def test_starting(compare, tmp_path):

@@ -2,6 +2,7 @@
 
 import timeit
 from collections.abc import Callable
+from contextlib import suppress
 
 import casadi as ca
 import numpy as np
@@ -26,11 +27,9 @@ def race(functions: dict[str, Callable], rounds: int = 300, number: int = 20) ->
 
 
 def has_compiler() -> bool:
-    try:
-        find_compiler()
-    except MachineCodeError:
-        return False
-    return True
+    with suppress(MachineCodeError):
+        return bool(find_compiler())
+    return False
 
 
 def prebound(function: ca.Function, *arguments) -> Callable:
@@ -68,6 +67,5 @@ def calls(functions: list[TracedFunction], *arguments) -> dict[str, Callable]:
 
 def times(found: dict[str, Callable]) -> dict[str, float]:
     """Their least times of a call, in s; of the loop in C that of one state."""
-    many = {name: one for name, one in found.items() if name == "in C"}
-    best = race({name: one for name, one in found.items() if name not in many})
-    return best | {name: took / STATES for name, took in race(many, number=1).items()}
+    many = {name: found.pop(name) for name in list(found) if name == "in C"}
+    return race(found) | {name: took / STATES for name, took in race(many, number=1).items()}

@@ -12,16 +12,9 @@ import numpy as np
 from drake_dae import Record
 from drake_dae.errors import DrakeDaeError
 
-RESULT, REFUSED, ODD, WRONG, RAW, HANG = (
-    "result",
-    "refused",
-    "accepted without a reason",
-    "wrong number",
-    "raw exception",
-    "hang or crash",
-)
-CLASSES = (RESULT, REFUSED, ODD, WRONG, RAW, HANG)
-BAD = (ODD, WRONG, RAW, HANG)
+CLASSES = ("result", "refused", "wrong number", "raw exception", "hang or crash")
+RESULT, REFUSED, WRONG, RAW, HANG = CLASSES
+BAD = (WRONG, RAW, HANG)
 """What must not be."""
 
 RESIDUAL = 1e-6
@@ -33,7 +26,7 @@ OFF = 1e-4
 
 @dataclass
 class Outcome:
-    """How an attempt ended: what it was, one of CLASSES, and the message or why it was accepted."""
+    """How an attempt ended: what it was, one of CLASSES, and the message."""
 
     what: str
     kind: str = RESULT
@@ -55,11 +48,6 @@ class Outcome:
         if not (finite and kept and off <= OFF):
             self.kind = WRONG
             self.text = f"finite {finite}, residual {residual:.2g}, off {off:.2g}"
-
-    def accepted(self, excuse: str) -> None:
-        """Says why a bad input may run."""
-        if self.kind == RESULT:
-            self.kind, self.text = (RESULT, excuse) if excuse else (ODD, "it ran")
 
 
 @contextmanager

@@ -2,19 +2,23 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from campaign.outcomes import Outcome, checked
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
+    FixedOffsetFrame,
     LinearSpringDamper,
+    PrismaticJoint,
     PrismaticSpring,
+    RevoluteJoint,
     RevoluteSpring,
     RpyFloatingJoint,
 )
 from pydrake.systems.analysis import SimulatorConfig
+from random_plants import random_inertia, random_pose
 
 from drake_dae import (
     AxisCoordinates,
@@ -54,15 +58,8 @@ SURFACES = ("plane", "sphere", "cylinder", "ellipsoid", "torus", "implicit")
 BINDINGS = ("nothing", "surface", "two surfaces", "pin", "loop", "weld", "welded branches")
 
 
-@dataclass
-class Tree:
-    """Links from a random URDF.
-
-    Attributes:
-        plant: Finalized.
-        positions: A random configuration, shape (nq,).
-        tips: The frames at the ends of branches, the one of the most joints first.
-    """
+class Tree(NamedTuple):
+    """Links: the finalized plant, a random q, and the tips of branches, the longest one first."""
 
     plant: MultibodyPlant
     positions: np.ndarray
@@ -71,15 +68,8 @@ class Tree:
 
 @dataclass
 class Plan:
-    """What a seed chose, in words, and the numbers of links.
-
-    Attributes:
-        stage: One of CHAINS.
-        binding: One of BINDINGS.
-        joints: How many, 2 to 7.
-        floating: Whether the base floats, without gravity.
-        passive: Whether the first joint of the tree has no actuator but a spring.
-    """
+    """What a seed chose: one of CHAINS and of BINDINGS, 2 to 7 joints, a base that floats without
+    gravity, a first joint that has no actuator but a spring; and what surfaces there are."""
 
     stage: str
     binding: str
@@ -126,7 +116,6 @@ def attempt(seed: int, folder: Path) -> Outcome:
         simulate(loop.diagram, context, DURATION, config)
         record = loop.record(context)
         outcome.figures(record, loop.predicted_error(record))
-        outcome.accepted(f"{plan.binding}, {plan.stage}")
     outcome.what = str(plan)
     return outcome
 
@@ -158,12 +147,26 @@ def _tree(random: Random, plan: Plan) -> Tree:
         elif branched and index > 1:
             chain = int(random.integers(-1, index))
         parents.append(chain)
-    text = _urdf(random, plan, parents)
     plant = MultibodyPlant(0.0)
-    Parser(plant).AddModelsFromString(text, "urdf")
+    base = plant.world_body()
     if plan.floating:
-        base = plant.GetFrameByName("base")
-        plant.AddJoint(RpyFloatingJoint("base", plant.world_frame(), base))
+        base = plant.AddRigidBody("base", random_inertia(random))
+        plant.AddJoint(RpyFloatingJoint("base", plant.world_frame(), base.body_frame()))
+    bodies = []
+    for index, parent in enumerate(parents):
+        above = bodies[parent] if parent >= 0 else base
+        bodies.append(plant.AddRigidBody(f"link{index}", random_inertia(random)))
+        own = bodies[-1].body_frame()
+        place = FixedOffsetFrame(f"place{index}", above.body_frame(), random_pose(random))
+        make = RevoluteJoint if random.random() < 0.75 else PrismaticJoint
+        damping = random.uniform(0.0, 0.5) * (random.random() < 0.5)
+        ends = plant.AddFrame(place), own, _direction(random)
+        joint = plant.AddJoint(make(f"joint{index}", *ends, damping=damping))
+        plant.AddFrame(FixedOffsetFrame(f"tip{index}", own, random_pose(random)))
+        if index or not plan.passive:
+            motor = plant.AddJointActuator(f"motor{index}", joint)
+            motor.set_default_rotor_inertia(random.uniform(1e-4, 1e-3))
+            motor.set_default_gear_ratio(30.0)
     _add_springs(random, plan, plant)
     if plan.floating or random.random() < 0.2:
         plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
@@ -175,47 +178,6 @@ def _tree(random: Random, plan: Plan) -> Tree:
     ends.sort(key=lambda index: -depth[index])
     positions = random.uniform(-1.2, 1.2, plant.num_positions())
     return Tree(plant, positions, [f"tip{index}" for index in ends])
-
-
-def _urdf(random: Random, plan: Plan, parents: list[int]) -> str:
-    parts = ['<robot name="random" xmlns:drake="http://drake.mit.edu">']
-    if plan.floating:
-        parts.append(f'<link name="base">{_inertial(random, 8.0)}</link>')
-    for index, parent in enumerate(parents):
-        above = f"link{parent}" if parent >= 0 else "base" if plan.floating else "world"
-        kind = "revolute" if random.random() < 0.75 else "prismatic"
-        parts.append(
-            f'<link name="link{index}">{_inertial(random, 2.0)}</link>'
-            f'<joint name="joint{index}" type="{kind}"><parent link="{above}"/>'
-            f'<child link="link{index}"/><axis xyz="{_words(_direction(random))}"/>'
-            f'<origin xyz="{_words(random.uniform(-0.5, 0.5, 3))}" '
-            f'rpy="{_words(random.uniform(-1.5, 1.5, 3))}"/>'
-            f'<dynamics damping="{random.uniform(0.0, 0.5) * (random.random() < 0.5):.3f}"/>'
-            '<limit lower="-3" upper="3" effort="1000" velocity="100"/></joint>'
-            f'<frame name="tip{index}" link="link{index}" '
-            f'xyz="{_words(random.uniform(-0.5, 0.5, 3))}" '
-            f'rpy="{_words(random.uniform(-1.5, 1.5, 3))}"/>'
-        )
-        if index or not plan.passive:
-            parts.append(
-                "<transmission><type>transmission_interface/SimpleTransmission</type>"
-                f'<joint name="joint{index}"/><actuator name="motor{index}">'
-                f'<drake:rotor_inertia value="{random.uniform(1e-4, 1e-3):.6f}"/>'
-                '<drake:gear_ratio value="30"/></actuator></transmission>'
-            )
-    return "".join([*parts, "</robot>"])
-
-
-def _inertial(random: Random, mass: float) -> str:
-    # Those of a box, which every body could be.
-    sides = random.uniform(0.1, 0.6, 3) ** 2
-    mass *= random.uniform(0.3, 1.5)
-    x, y, z = mass / 12 * (sides.sum() - sides)
-    return (
-        f'<inertial><origin xyz="{_words(random.uniform(-0.2, 0.2, 3))}"/>'
-        f'<mass value="{mass:.4f}"/>'
-        f'<inertia ixx="{x:.6f}" iyy="{y:.6f}" izz="{z:.6f}" ixy="0" ixz="0" iyz="0"/></inertial>'
-    )
 
 
 def _add_springs(random: Random, plan: Plan, plant: MultibodyPlant) -> None:
@@ -374,7 +336,3 @@ def _reference(random: Random, goal: float) -> ConstantReference | SinusoidRefer
 def _direction(random: Random) -> np.ndarray:
     vector = random.normal(size=3)
     return vector / np.linalg.norm(vector)
-
-
-def _words(values: np.ndarray) -> str:
-    return " ".join(f"{value:.6f}" for value in values)

@@ -24,49 +24,31 @@ SURFACES = ("plane", "cylinder", "sphere")
 
 ROBOTS = {
     "example-robot-data": """
-        a1_description/urdf/a1.urdf
-        alex_description/urdf/alex_nub_hands.urdf
+        a1_description/urdf/a1.urdf alex_description/urdf/alex_nub_hands.urdf
         alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf
         allegro_hand_description/urdf/allegro_right_hand.urdf
         anymal_b_simple_description/robots/anymal-kinova.urdf
-        anymal_c_simple_description/urdf/anymal.urdf
-        asr_twodof_description/urdf/TwoDofs.urdf
-        b1_description/urdf/b1-z1.urdf
-        baxter_description/urdf/baxter.urdf
-        bolt_description/robots/bolt.urdf
-        borinot_description/urdf/borinot_flying_arm_2.urdf
-        cassie_description/robots/cassie.sdf
-        cassie_description/robots/cassie_v2.sdf
+        anymal_c_simple_description/urdf/anymal.urdf asr_twodof_description/urdf/TwoDofs.urdf
+        b1_description/urdf/b1-z1.urdf baxter_description/urdf/baxter.urdf
+        bolt_description/robots/bolt.urdf borinot_description/urdf/borinot_flying_arm_2.urdf
+        cassie_description/robots/cassie.sdf cassie_description/robots/cassie_v2.sdf
         centauro_description/urdf/centauro.urdf
         double_pendulum_description/urdf/double_pendulum.urdf
         double_pendulum_description/urdf/double_pendulum_continuous.urdf
         double_pendulum_description/urdf/double_pendulum_simple.urdf
-        finger_edu_description/robots/finger_edu.urdf
-        g1_description/urdf/g1_29dof_rev_1_0.urdf
-        g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf
-        go1_description/urdf/go1.urdf
-        go2_description/urdf/go2.urdf
-        hector_description/robots/quadrotor_base.urdf
-        hextilt_description/urdf/hextilt_flying_arm_5.urdf
-        human_description/robots/human.urdf
-        hyq_description/robots/hyq_no_sensors.urdf
-        icub_description/robots/icub.urdf
-        iris_description/robots/iris.urdf
-        laikago_description/urdf/laikago.urdf
-        pr2_description/urdf/pr2.urdf
-        quadruped_description/urdf/quadruped.urdf
-        romeo_description/urdf/romeo.urdf
-        simple_humanoid_description/urdf/simple_humanoid.urdf
-        so_arm_description/urdf/so101.urdf
-        solo_description/robots/solo.urdf
-        solo_description/robots/solo12.urdf
-        talos_data/robots/talos_full_v2.urdf
-        talos_data/robots/talos_left_arm.urdf
-        tiago_description/robots/tiago_dual.urdf
-        tiago_pro_description/robots/tiago_pro.urdf
-        ur_description/urdf/ur3_robot.urdf
-        ur_description/urdf/ur3_gripper.urdf
-        ur_description/urdf/ur5_gripper.urdf
+        finger_edu_description/robots/finger_edu.urdf g1_description/urdf/g1_29dof_rev_1_0.urdf
+        g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf go1_description/urdf/go1.urdf
+        go2_description/urdf/go2.urdf hector_description/robots/quadrotor_base.urdf
+        hextilt_description/urdf/hextilt_flying_arm_5.urdf human_description/robots/human.urdf
+        hyq_description/robots/hyq_no_sensors.urdf icub_description/robots/icub.urdf
+        iris_description/robots/iris.urdf laikago_description/urdf/laikago.urdf
+        pr2_description/urdf/pr2.urdf quadruped_description/urdf/quadruped.urdf
+        romeo_description/urdf/romeo.urdf simple_humanoid_description/urdf/simple_humanoid.urdf
+        so_arm_description/urdf/so101.urdf solo_description/robots/solo.urdf
+        solo_description/robots/solo12.urdf talos_data/robots/talos_full_v2.urdf
+        talos_data/robots/talos_left_arm.urdf tiago_description/robots/tiago_dual.urdf
+        tiago_pro_description/robots/tiago_pro.urdf ur_description/urdf/ur3_robot.urdf
+        ur_description/urdf/ur3_gripper.urdf ur_description/urdf/ur5_gripper.urdf
         ur_description/urdf/ur10_joint_limited_robot.urdf
     """,
     "robosuite": """
@@ -75,32 +57,15 @@ ROBOTS = {
         ur5e/robot.xml xarm7/robot.xml
     """,
     "pybullet_data": """
-        TwoJointRobot_w_fixedJoints.urdf
-        TwoJointRobot_wo_fixedJoints.urdf
-        a1/a1.urdf
-        aliengo/aliengo.urdf
-        biped/biped2d_pybullet.urdf
-        cartpole.urdf
-        franka_panda/panda.urdf
-        gripper/wsg50_one_motor_gripper_left_finger.urdf
-        humanoid/humanoid.urdf
-        husky/husky.urdf
-        kuka_iiwa/model.urdf
-        kuka_iiwa/model_free_base.urdf
-        laikago/laikago_toes.urdf
-        mini_cheetah/mini_cheetah.urdf
-        pendulum5.urdf
-        pr2_gripper.urdf
-        quadruped/minitaur.urdf
-        quadruped/spirit40.urdf
-        quadruped/vision60.urdf
-        r2d2.urdf
-        racecar/racecar.urdf
-        xarm/xarm6_robot.urdf
-        xarm/xarm6_with_gripper.urdf
-        mjcf/ant.xml mjcf/half_cheetah.xml mjcf/hopper.xml mjcf/humanoid.xml
-        mjcf/inverted_double_pendulum.xml mjcf/pusher.xml mjcf/reacher.xml mjcf/striker.xml
-        mjcf/swimmer.xml mjcf/thrower.xml mjcf/walker2d.xml
+        TwoJointRobot_w_fixedJoints.urdf TwoJointRobot_wo_fixedJoints.urdf a1/a1.urdf
+        aliengo/aliengo.urdf biped/biped2d_pybullet.urdf cartpole.urdf franka_panda/panda.urdf
+        gripper/wsg50_one_motor_gripper_left_finger.urdf humanoid/humanoid.urdf husky/husky.urdf
+        kuka_iiwa/model.urdf kuka_iiwa/model_free_base.urdf laikago/laikago_toes.urdf
+        mini_cheetah/mini_cheetah.urdf pendulum5.urdf pr2_gripper.urdf quadruped/minitaur.urdf
+        quadruped/spirit40.urdf quadruped/vision60.urdf r2d2.urdf racecar/racecar.urdf
+        xarm/xarm6_robot.urdf xarm/xarm6_with_gripper.urdf mjcf/ant.xml mjcf/half_cheetah.xml
+        mjcf/hopper.xml mjcf/humanoid.xml mjcf/inverted_double_pendulum.xml mjcf/pusher.xml
+        mjcf/reacher.xml mjcf/striker.xml mjcf/swimmer.xml mjcf/thrower.xml mjcf/walker2d.xml
     """,
 }
 """Package -> the files of robots, none of which any test names."""

@@ -15,14 +15,13 @@ from pebble import ProcessExpired, ProcessPool
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 
-from campaign import bad_inputs, random_robots, random_tasks
-from campaign.outcomes import BAD, CLASSES, HANG, RESULT, Outcome
+from campaign import bad_inputs, random_robots
+from campaign.outcomes import BAD, CLASSES, HANG, Outcome
 
 ATTEMPTS = {
     "inputs": (bad_inputs.scenario_attempt, 1500, 30.0),
     "files": (bad_inputs.file_attempt, 1000, 30.0),
     "robots": (random_robots.attempt, 500, 30.0),
-    "tasks": (random_tasks.attempt, 1000, 300.0),
 }
 """Kind -> its function of a seed and a folder, how many there are, and the time limit of one, s."""
 
@@ -36,13 +35,11 @@ def attempt(kind: str, seed: int) -> Outcome:
 
 
 def report(kind: str, outcomes: dict[int, Outcome]) -> None:
-    """Prints counts per class, why what runs runs, and every attempt that ended as it must not."""
+    """Prints counts per class, and every attempt that ended as it must not."""
     counts = Counter(outcome.kind for outcome in outcomes.values())
     print(
         f"\n{len(outcomes)} {kind}", *(f"  {counts[each]:5d}  {each}" for each in CLASSES), sep="\n"
     )
-    ran = Counter(outcome.text for outcome in outcomes.values() if outcome.kind == RESULT)
-    print(*(f"  {count:7d}  {text}" for text, count in ran.most_common(20)), sep="\n")
     for seed, outcome in sorted(outcomes.items()):
         if outcome.kind in BAD:
             print(f"  seed {seed}: {outcome.kind}: {outcome.what}\n      {outcome.text[:300]}")

@@ -50,13 +50,6 @@ def test_a_file_is_replaced_by_force_alone_and_what_is_none_never(words, suffix,
     assert (file.read_text(), target.read_text()) == ("mine", "mine")
 
 
-@pytest.mark.parametrize("command", ["simulate", "export", "sweep --vary=duration=[1]"])
-def test_a_folder_is_no_device(command, capsys):
-    name, *more = command.split()
-    assert main([name, "two_link_wall", *more, "--out=/dev/null"]) == 1
-    assert "'/dev/null'" in error_line(capsys)
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [

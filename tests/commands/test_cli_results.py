@@ -2,15 +2,10 @@
 
 import json
 
-import numpy as np
 import pytest
 
-from drake_dae import Record, load_scenario
+from drake_dae import Record
 from drake_dae.cli import main
-from drake_dae.running import export as exported
-from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.shipped import find_scenario
-from drake_dae.scenario.start import start_scenario
 from drake_dae.studies.study import FILES
 
 BARE = ("--set=write.plots=false", "--set=write.animation=false")
@@ -64,31 +59,6 @@ def test_a_good_run_is_reported_with_figures_and_files(tmp_path, capsys):
     assert 0.0 <= max(one["off_prediction"] for one in outputs.values()) < 1e-6
 
 
-@pytest.mark.slow
-def test_all_commands_start_at_the_same_state(tmp_path, monkeypatch):
-    """Also where start.positions are left out, and the robot's default leads elsewhere."""
-    found = {}
-
-    def kept(loop, context, *_):
-        own = loop.plant.GetMyContextFromRoot(context)
-        found["export"] = own.get_continuous_state_vector().CopyToVector()
-        return [tmp_path / "loop.c"]
-
-    monkeypatch.setattr(exported, "export_loop", kept)
-    settings = ["--set=start={}", "--set=duration=0.01", *BARE]
-    assert main(["export", "two_link_wall", *settings, f"--out={tmp_path / 'code'}"]) == 0
-    assert main(["simulate", "two_link_wall", *settings, f"--out={tmp_path / 'run'}"]) == 0
-    first = Record.load(tmp_path / "run" / "record.npz")["state"][0]
-    np.testing.assert_allclose(found["export"], first, atol=1e-9)
-    # And a loop that is started by what it was built from.
-    scenario = load_scenario(find_scenario("two_link_wall"), ["start={}"])
-    _, loop = build_completed(scenario)
-    context = start_scenario(scenario, loop)
-    own = loop.plant.GetMyContextFromRoot(context)
-    state = own.get_continuous_state_vector().CopyToVector()
-    np.testing.assert_allclose(state, first, atol=1e-9)
-
-
 # Of a study.
 
 SHORT = ["--set", "duration=0.2", "--set", "compiled=false"]
@@ -117,30 +87,3 @@ def test_it_leaves_its_files_and_tells_programs_and_people(tmp_path, monkeypatch
     said = capsys.readouterr().err
     assert "duration" in said
     assert "runs/two_link_wall-sweep/runs.db" in said
-
-
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        (["--vary", "start.errors.tool=0.1"], "start.errors: no output 'tool'"),
-        (["--vary", "start.error=0.1"], "start: has no key 'error'; did you mean 'errors'"),
-        (["--vary", "duration=1..2"], "duration: 1..2 needs the number of its values"),
-        (["--vary", "duration=1..2", "--random", "0"], "count must be a whole number from 1"),
-        (["--vary", "duration=1", "--workers", "0"], "workers must be a whole number from 1"),
-        (["--vary", "plant.parameters.a=1"], "plant.parameters: two_link_arm: no parameter 'a'"),
-    ],
-)
-def test_errors_are_reported_before_anything_runs(options, line, tmp_path, capsys):
-    folder = tmp_path / "out"
-    assert main(["sweep", "two_link_wall", *options, *SHORT, "--out", str(folder)]) == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("error: ")
-    assert line in said
-    assert not folder.exists()
-
-
-def test_the_files_of_others_are_left_alone(tmp_path, capsys):
-    (tmp_path / "runs.csv").write_text("mine")
-    assert main(["sweep", "two_link_wall", *VARY, *SHORT, "--out", str(tmp_path)]) == 1
-    assert "runs.csv" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["runs.csv"]

@@ -1,5 +1,7 @@
 """Equilibria of zero dynamics, and verdicts at rest: by eigenvalues, at what is an equilibrium."""
 
+import re
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -19,7 +21,6 @@ from problems.zero_systems import (
 from runs import some
 
 from drake_dae.dae import DaeSystem, Verdict, ZeroDynamics
-from drake_dae.errors import InconsistentStateError
 
 
 def tanks_at_rest(pumps, valves, levels) -> tuple[Array, Array]:
@@ -40,7 +41,7 @@ def test_zeros_of_the_four_tanks(plant):
     t3, t4 = (TANK_AREAS / HOLES * np.sqrt(2 * levels / TANK_GRAVITY))[2:]
     g1, g2 = plant["valves"]
     expected = np.roots([t3 * t4, t3 + t4, 1 - (1 - g1) * (1 - g2) / (g1 * g2)])
-    found = dynamics.eigenvalues(dynamics.equilibrium(plant["levels"]))
+    found = dynamics.stability(outputs=plant["levels"]).eigenvalues
     # An equilibrium to 1e-12.
     np.testing.assert_allclose(found, np.sort(expected)[::-1], rtol=1e-9)
     stability = dynamics.stability()
@@ -61,9 +62,9 @@ def test_equilibrium_of_a_robot_against_multibody_plant():
     name, kind = "two_link", "damped"
     robot = actuated(name, kind)
     expected, _ = at_rest(name, kind, start_position(name), 25.0)
-    found = ZeroDynamics(robot.structure.system, structure=robot.structure).equilibrium(
-        [*OFFSET[name], 25.0]
-    )
+    dynamics = ZeroDynamics(robot.structure.system, structure=robot.structure)
+    guess = robot.structure.system.nominal_state[None]
+    (found,) = dynamics.equilibria(guess, outputs=[*OFFSET[name], 25.0])
     # The plant and the library differ by round-off of forces of 100 N over stiffnesses of 5e3.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
@@ -71,29 +72,27 @@ def test_equilibrium_of_a_robot_against_multibody_plant():
 def test_no_equilibrium_is_reported():
     """s' = 1 + s^2 has none, nor has a blade pinned to a speed; with speed 0 it has many."""
     dynamics = zero_dynamics(internal(lambda s, z: 1 + s**2))
-    with pytest.raises(InconsistentStateError, match=r"z = 0 .*s' = ") as e:
-        dynamics.equilibrium([0.0])
-    assert e.value.residual[1] >= 1.0
-    growing = dynamics.stability()
+    assert not len(dynamics.equilibria(outputs=[0.0]))
+    growing = dynamics.stability(outputs=[0.0])
+    assert re.search(r"z = 0 .*s' = ", growing.reason)
     assert growing.verdict is Verdict.UNDECIDED
     assert (growing.state, growing.eigenvalues.shape) == (None, (0,))
 
     blade = zero_dynamics(PROBLEMS["knife_edge"]().system)
-    with pytest.raises(InconsistentStateError, match=r"V = 0\.8"):
-        blade.equilibrium([0.3, 0.8])
+    assert not len(blade.equilibria(outputs=[0.3, 0.8]))
+    assert "V = 0.8" in blade.stability(outputs=[0.3, 0.8]).reason
     assert blade.stability().verdict is Verdict.UNDECIDED
     # Of the continuum (x, y) none is isolated; what is judged is at the guess.
     rest = np.array([2.0, -1.0, 0.3, 0.0, 0.0, 0.0])
-    with pytest.raises(InconsistentStateError):
-        blade.equilibrium([0.3, 0.0], rest)
+    assert not len(blade.equilibria(rest, outputs=[0.3, 0.0]))
     still = blade.stability(rest)
     assert still.verdict is Verdict.UNDECIDED
     np.testing.assert_allclose(still.state, rest, rtol=0, atol=1e-12)
     np.testing.assert_allclose(still.eigenvalues, [0.0, 0.0], atol=1e-12)
 
 
-def test_a_clock_among_the_states_is_reported():
-    """A force beside c' = 1, held through a matrix whose round-off was divided by: z1 = 3e13."""
+def test_a_system_with_a_clock_does_not_rest():
+    """c' = 1, y' = cos c, and a force held through a matrix whose round-off was divided by."""
     system = DaeSystem.from_functions(
         ["x", "y", "vx", "vy", "c"],
         f=lambda s: [s[2], s[3], 0, 0, 1],
@@ -108,7 +107,7 @@ def test_a_clock_among_the_states_is_reported():
     for outputs in (None, [0.0, 10.0]):
         stability = dynamics.stability(dynamics.structure.states[0], outputs=outputs)
         assert stability.verdict is Verdict.UNDECIDED
-        assert "c' = 1" in stability.reason
+        assert re.search("[cy]' = 1$", stability.reason)
         assert "z1" not in stability.reason
 
 
@@ -177,8 +176,6 @@ def test_what_only_falls_is_no_equilibrium(name, others):
     rate = AT_INFINITY[name]
     more = [lambda *_: [], lambda a, b, z: [-b], lambda a, b, c, z: [c, -b - c]][others]
     dynamics = ZeroDynamics(beside(lambda *x: [rate(x[0]), *more(*x)], 1 + others))
-    with pytest.raises(InconsistentStateError, match="z0 = 0"):
-        dynamics.equilibrium([0.0])
     random = np.random.default_rng(0)
     guesses = random.uniform(-3.0, 60.0, (6, 2 + others))
     assert not len(dynamics.equilibria(guesses, outputs=[0.0]))

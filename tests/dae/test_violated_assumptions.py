@@ -158,7 +158,7 @@ def test_the_rows_that_follow_are_named_with_their_factors():
     )
     assert found.cause is ViolationKind.REDUNDANT
     corner, again = found.combinations
-    assert (corner.name, corner.others, corner.constant) == ("corner", ("floor", "wall"), True)
+    assert (corner.name, corner.others) == ("corner", ("floor", "wall"))
     np.testing.assert_allclose(corner.factors, [3.0, -1.0], rtol=1e-9)
     assert (again.name, again.others) == ("wall again", ("wall",))
     np.testing.assert_allclose(again.factors, [1000.0], rtol=1e-9)

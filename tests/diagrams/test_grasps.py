@@ -11,9 +11,6 @@ from numpy.testing import assert_allclose
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
-from drake_dae import build_scenario
-from drake_dae.errors import ScenarioError
-
 HOURS = 120.0 * np.pi / 180.0 * np.arange(3)
 CORNERS = 0.035 * np.column_stack([np.cos(HOURS), np.sin(HOURS), np.zeros(3)])
 """Where the fingers hold the puck, in its axes, m."""
@@ -136,37 +133,3 @@ def test_forces_of_two_arms_on_a_free_box_are_those_of_drake():
         internal = (left - right) / 2.0
         assert_allclose(record["controlled_output"][step, 8:], internal, atol=1e-9)
         assert left[0] > 10.0 > -10.0 > right[0]  # Both press.
-
-
-# What does not fit.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "setting", "words"),
-    [
-        ("three_fingers", "robot.free=[]", ["robot.file: ", "'object'", "robot.free"]),
-        ("three_fingers", "robot.free=[objct]", ["robot.free: ", "'objct'"]),
-        ("biped", "robot.free=[trunk]", ["robot.free: ", "'trunk'", "'pitch'"]),
-        ("three_fingers", "forces.0.first=grip", ["forces.0: ", "'grip'"]),
-        ("three_fingers", "forces.1.frame=obj", ["forces.1: ", "'grip2'", "'obj'"]),
-        ("three_fingers", "forces.1.second=grip2", ["forces.1: "]),
-        (
-            "three_fingers",  # What moves the puck, too.
-            "forces.2=!ForceCombination {name: grip3.grip1.squeeze, "
-            "weights: {grip1.fx: 1, grip2.fx: 1, grip3.fx: 1}}",
-            ["outputs: ", "(5)", "object_x"],
-        ),
-        ("biped", "forces.0=!ForceCombination {weights: {}, name: a}", ["forces.0: ", "'a'"]),
-        (
-            "biped",
-            "forces.0=!ForceCombination {weights: {front.forc: 1}, name: a}",
-            ["forces.0: ", "'front.forc'", "'front.force'"],
-        ),
-    ],
-)
-def test_what_does_not_fit_is_reported_with_its_key(name, setting, words):
-    with pytest.raises(ScenarioError) as caught:
-        build_scenario(scenario(name, setting))
-    message = str(caught.value)
-    assert [word for word in words if word not in message] == [], message

@@ -7,7 +7,6 @@ from pydrake.math import RollPitchYaw
 from recordings import animation
 
 from drake_dae import build_scenario, load_scenario, make_animation, simulate
-from drake_dae.errors import ScenarioError
 from drake_dae.scenario.shipped import find_scenario
 
 NAME = "seven_joint_moving_plate"
@@ -52,21 +51,3 @@ def test_the_plate_moves_in_the_animation():
     turns = found["/contact/plate/surface", "quaternion"].values  # x, y, z, w
     wanted = np.array([r.ToQuaternion().wxyz()[[1, 2, 3, 0]] for r in roll])
     assert_allclose(turns, wanted, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("exogenous={plate.positio: []}", r"exogenous: .*'plate.positio'"),
-        ("exogenous={plate.rpy: []}", r"plate.rpy: .*3.*0"),
-        (
-            "exogenous={plate.rpy: [!PointToPoint {start: [0, 0, 0], end: [1, 0, 0], duration: 1,"
-            " order: 1}]}",
-            r"exogenous.plate.rpy.0: .*",
-        ),
-    ],
-)
-def test_wrong_signals_are_reported_with_their_key(setting, message):
-    with pytest.raises(ScenarioError, match=message):
-        build_scenario(scenario(setting))

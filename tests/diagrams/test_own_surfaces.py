@@ -9,7 +9,6 @@ from runs import run_scenario, scenario
 
 from drake_dae import load_scenario
 from drake_dae.cli import main
-from drake_dae.errors import ScenarioError
 from drake_dae.scenario import complete_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.scenario import save_scenario
@@ -80,28 +79,6 @@ def test_where_the_robot_leaves_the_data_is_reported(tmp_path):
     _, told = judge_run(case, loop, context, record).notes
     assert "wall: the robot is beyond the edge of the data by up to 1" in told
     assert "1 mm, first at 0 s; there the surface continues as a plane" in told
-
-
-@pytest.mark.parametrize(
-    ("surface", "key", "words"),
-    [
-        ("!ImplicitSurface {function: z - q}", "", "column 5: no name 'q'"),
-        ("!ImplicitSurface {function: 3}", ".function", "expected text, got 3"),
-        ("!ImplicitSurface {function: z, parameters: [1]}", ".parameters", "names with values"),
-        ("!ImplicitSurface {function: z, parameters: {a: x}}", ".parameters.a", "a number"),
-        ("!MeasuredSurface {size: [1, 1]}", "", "heights"),
-        ("!MeasuredSurface {size: [1], heights: [[0, 1], [1, 2]]}", ".size", "[1]"),
-        ("!MeasuredSurface {size: [1, 1], heights: [[0, 1], [1]]}", ".heights", "length"),
-        ("!MeasuredSurface {size: [1, 1], file: none.csv}", "", "none.csv"),
-        ("!MeasuredSurface {file: none.stl}", "", "none.stl"),
-        ("!MeasuredSurface {file: a.obj, normal: up}", ".normal", "3 numbers"),
-    ],
-)
-def test_wrong_surfaces_are_reported_at_their_key(surface, key, words):
-    with pytest.raises(ScenarioError) as caught:
-        scenario("two_link_wall", f"constraints.0.surface={surface}")
-    ((found, _),) = [p for p in caught.value.problems if words in p[1]]
-    assert found == f"constraints.0.surface{key}"
 
 
 @pytest.mark.slow

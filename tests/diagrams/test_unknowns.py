@@ -8,7 +8,6 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario, scenario_model
 
 from drake_dae import build_scenario
-from drake_dae.errors import ScenarioError
 
 W = 25.0
 STILL = (
@@ -105,19 +104,3 @@ def test_surface_may_be_tilted():
     force = record["contact_force"][-1]
     normal = RollPitchYaw(turned).ToRotationMatrix() @ [-1.0, 0.0, 0.0]
     assert_allclose(force / np.linalg.norm(force), normal, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ("plant.disturbances=[{frame: tol, force: [0, 0, 1]}]", r"plant.disturbances.0: .*'tol'"),
-        ("plant.payloads=[{frame: tool, mass: 0}]", r"plant.payloads.0: .*mass"),
-        ("plant.payloads=[{frame: tool, mass: 1}, {frame: tool, mass: 1}]", "plant.payloads.1: "),
-        ("plant.disturbances=[{frame: world, force: [0, 0, 1]}]", "plant.disturbances.0: "),
-        ("sampling={period: 0.001}", r"sampling: .*0\.001"),
-    ],
-)
-def test_what_is_not_there_is_refused(settings, message):
-    with pytest.raises(ScenarioError, match=message):
-        build_scenario(two_link(*CONTACT, settings))

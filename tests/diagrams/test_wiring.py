@@ -77,28 +77,6 @@ def test_all_signals_are_in_one_log_of_which_the_record_is_cut(name):
         assert record.signals[signal].signals == names
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "setting", "message"),
-    [
-        ("two_link_flexible", "actuation.0.stiffness=[-1]", "actuation.0: "),
-        ("two_link_wall", "actuation=[!FlexibleJoints {stiffness: [8e3]}]", "joint1_motor"),
-        ("two_link_motors", "actuation.0.torque_constant=[0]", "torque_constant"),
-        ("two_link_wall", ["sensors.force={}", "law.force_gain=1"], "time_constant"),
-        (
-            "two_link_wall",
-            ["sensors.force={sample_period: 0.01}", "law.force_gain=2"],
-            "sensors.force: ",
-        ),
-        ("two_link_wall", "plant.parameters={link3.mass: [1]}", "'link3.mass'"),
-        ("two_link_wall", "start.errors={wall.force: 1}", "wall.force"),
-    ],
-)
-def test_refusals_name_the_key(name, setting, message):
-    with pytest.raises(ScenarioError, match=message):
-        dd.build_scenario(scenario(name, *([setting] if isinstance(setting, str) else setting)))
-
-
 @pytest.mark.parametrize(
     ("setting", "start"),
     [

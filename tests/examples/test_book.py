@@ -5,15 +5,12 @@ import os
 import re
 import subprocess
 from pathlib import Path
-from urllib.parse import quote
 
 import pytest
 from book.generated import public_names, uses
 from book.notebooks import has_code, notebook
 from book.pages import BOOK, PageError, blocks, compare, pages, run_page
-from browser import BUDGET, CHROMIUM, OPTIONS, low_contrast
-
-MARKED = re.MULTILINE | re.DOTALL
+from browser import CHROMIUM, low_contrast
 
 SLOW = {
     "explanations/force.md",
@@ -48,36 +45,12 @@ def test_page_runs_as_shown(page, tmp_path):
     run_page(page, tmp_path / page.stem, pictures=False)
 
 
-@pytest.mark.parametrize(
-    ("shown", "printed"),
-    [
-        ("0.35 m", "0.354 m"),
-        ("1.2e-3", "0.0012"),
-        ("a ... b", "a 1\n2 b"),
-        ("joint2 at 1.5", "joint2  at 1.49"),
-        ("12 steps", "12 steps\n"),
-        ("[20.  0.5]", "[20.  0.5]"),
-    ],
-)
-def test_equal_to_the_digits_shown(shown, printed):
-    compare(shown, printed)
-
-
-@pytest.mark.parametrize(
-    ("shown", "printed"),
-    [
-        ("0.35 m", "0.362 m"),
-        ("12 steps", "13 steps"),
-        ("joint2 at 1.5", "joint3 at 1.5"),
-        ("a ... b", "a 1"),
-        ("1.2e-3", "0.0015"),
-        ("12 steps", "12.5 steps"),
-        ("", "something"),
-    ],
-)
-def test_what_differs_is_found(shown, printed):
-    with pytest.raises(PageError):
+def test_a_page_is_compared_to_the_digits_that_it_shows():
+    for shown, printed in (("0.35 m", "0.354 m"), ("1.2e-3", "0.0012"), ("a ... b", "a 1\n2 b")):
         compare(shown, printed)
+    for shown, printed in (("0.35 m", "0.362 m"), ("12 steps", "12.5 steps"), ("a ... b", "a 1")):
+        with pytest.raises(PageError):
+            compare(shown, printed)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +58,6 @@ def test_what_differs_is_found(shown, printed):
     [
         ("# T\n\n```python\nx = 1\n1 / 0\n```\n", 4),
         ("# T\n\n```python\nprint(1)\n```\n\n```text\n2\n```\n", 4),
-        ("# T\n\n```console\n$ drake-dae print no_such_scenario\n```\n", 4),
         ("# T\n\n```console\n$ false\n```\n", 4),
     ],
 )
@@ -95,19 +67,6 @@ def test_block_that_fails_is_named_by_its_line(text, line, tmp_path, monkeypatch
     monkeypatch.setattr("book.pages.BOOK", tmp_path)
     with pytest.raises(PageError, match=rf"page.md, line {line}: "):
         run_page(page, tmp_path / "page")
-
-
-def test_files_commands_and_code_share_a_folder(tmp_path, monkeypatch):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "# T\n\n```yaml\n# one.yaml\nvalue: 3\n```\n\n"
-        "```console\n$ cat one.yaml | wc -l\n1\n```\n\n"
-        "```python\nfrom pathlib import Path\nprint(Path('one.yaml').read_text())\n```\n\n"
-        "```text\nvalue: 3\n```\n",
-        "utf-8",
-    )
-    run_page(page, tmp_path / "page")
-    assert (tmp_path / "page" / "one.yaml").read_text() == "value: 3\n"
 
 
 def test_links_lead_to_pages_files_and_headings():
@@ -127,15 +86,6 @@ def test_links_lead_to_pages_files_and_headings():
                 assert heading in slugs, f"{named(page)}: {target}"
 
 
-def test_pictures_and_live_figures_say_in_words_what_they_show():
-    for page in [*pages(), BOOK.parents[1] / "README.md"]:
-        text = page.read_text("utf-8")
-        texts = re.findall(r"!\[([^\]]*)\]\(", text)
-        for frame in re.findall(r"<iframe[^>]*>", text):
-            texts += re.findall(r'title="([^"]*)"', frame) or [""]
-        assert all(len(one) > 20 for one in texts), (page, texts)
-
-
 def test_pages_are_in_the_contents():
     listed = set()
     for page in pages():
@@ -145,21 +95,13 @@ def test_pages_are_in_the_contents():
     assert {named(page) for page in pages()[1:]} <= listed
 
 
-def test_a_notebook_has_what_its_page_runs_in_its_order():
+def test_a_notebook_has_the_code_of_its_page_in_its_order():
     for page in filter(has_code, pages()):
         cells = json.loads(notebook(page))["cells"]
         code = iter("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
         for block in blocks(page):
             if block.language == "python":
                 assert block.text.rstrip("\n") in code, page  # Which goes on from there.
-            elif block.language == "console":
-                first = block.text.splitlines()[0].removeprefix("$ ")
-                assert any(cell.startswith(f"!{first}") for cell in code), page
-        prose = "".join(cell["source"] for cell in cells if cell["cell_type"] == "markdown")
-        text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=MARKED)
-        titles = re.findall(r"^#+ .*", text, re.MULTILINE)
-        assert [title for title in titles if title not in prose] == [], page
-        assert ".md)" not in prose, page
 
 
 def test_every_public_name_is_used_in_a_page_or_an_example_that_runs():
@@ -180,24 +122,3 @@ def test_site_is_made_and_loads_nothing_from_outside(tmp_path):
     if CHROMIUM:
         for page in ("index", "how_to/gains", "reference/errors", "tutorials/first_contact"):
             assert low_contrast(tmp_path / "site" / f"{page}.html") == {}, page
-        for question, answer in QUESTIONS.items():
-            assert f"how_to/{answer}.html" in first_of_search(tmp_path / "site", question, tmp_path)
-
-
-QUESTIONS = {
-    "own controller": "own_controller",
-    "contact force in my diagram": "own_controller",
-    "friction": "friction",
-    "controller for embedded": "real_arm",
-    "unknown tool weight force error": "wrong_model",
-}
-"""What a user looks for -> the page that answers it."""
-
-
-def first_of_search(site: Path, question: str, folder: Path) -> list[str]:
-    """The addresses of the first three pages that the search of the site finds."""
-    address = f"{(site / 'search.html').as_uri()}?q={quote(question)}"
-    words = [CHROMIUM, *OPTIONS, f"--user-data-dir={folder / 'profile'}", BUDGET, "--dump-dom"]
-    done = subprocess.run([*words, address], capture_output=True, text=True, timeout=600)
-    found = re.findall(r'<li class="kind-\w+"><a href="([^"?#]*)', done.stdout)
-    return list(dict.fromkeys(found))[:3]

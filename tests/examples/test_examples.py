@@ -1,24 +1,18 @@
 """The examples run, keep their claims and leave their pictures."""
 
-import importlib.util
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numpy.testing import assert_allclose
 from runs import some
 
 pytestmark = pytest.mark.slow
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-def load(name):
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 CLAIMS = {
@@ -50,7 +44,7 @@ def test_every_example_has_its_claim():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(CLAIMS, of=1, dear=DEAR))
 def test_example(name, tmp_path, capsys):
-    figures = load(name).main(tmp_path)
+    figures = runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"](tmp_path)
     figures = figures if isinstance(figures, tuple) else (figures,)
     for figure, claim in zip(figures, CLAIMS[name], strict=True):
         assert 0.0 <= figure < claim
@@ -68,9 +62,22 @@ def test_a_folder_that_is_not_there(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
-def test_an_example_runs_by_itself(tmp_path):
-    subprocess.run(
-        [sys.executable, EXAMPLES / "textbook_robot.py", tmp_path], check=True, timeout=600
-    )
-    assert (tmp_path / "textbook_robot.png").exists()
+def test_the_notebook_of_a_first_contact(capsys):
+    found = runpy.run_path(str(EXAMPLES / "notebook_first_contact.py"))
+    assert found["off"] < 1e-8
+    assert "<title>A two-link arm on a wall</title>" in found["page"]
+    assert found["page"]._repr_html_().startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
+    assert "from 0 to 3 s" in repr(found["record"])
+    assert "errors are off the predicted ones by" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_notebook_of_theory():
+    """The hoop pulls the bead by its weight and more: m (g cos + v^2 / r)."""
+    found = runpy.run_path(str(EXAMPLES / "notebook_theory.py"))
+    assert found["hoop"] < 1e-9
+    assert found["off"] < 1e-8
+    x, z, vx, vz = found["record"]["state"].T
+    # Along the hoop's inner normal (-x, -z): v g = -force, u pushes along x.
+    pull = 9.81 * z - found["record"]["control"][:, 0] * x - vx**2 - vz**2
+    assert_allclose(found["record"]["constraint_force"][:, 0], pull, atol=1e-7)

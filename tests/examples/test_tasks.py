@@ -6,14 +6,13 @@ import warnings
 from pathlib import Path
 
 import pytest
+from command_line import QUICK
 
-from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.errors import GeometryWarning
 
 TASKS = sorted((Path(__file__).parents[2] / "examples" / "tasks").glob("*.yaml"))
 SHARE = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share")
-BARE = ["--set", "write.plots=false", "--set", "write.animation=false"]
 
 
 def find_vendors(task, monkeypatch):
@@ -42,28 +41,9 @@ def test_tasks_are_short():
 )
 def test_task_is_tracked_as_predicted(task, tmp_path, monkeypatch, capsys):
     """Also where the verdict has the integrator's default accuracy, 1e-6."""
-    arguments = ["simulate", str(task), "--json", "--out", str(tmp_path / "run"), *BARE]
+    arguments = ["simulate", str(task), "--json", "--out", str(tmp_path / "run"), *QUICK]
     find_vendors(task, monkeypatch)
     with warnings.catch_warnings(action="ignore", category=GeometryWarning):
         assert main(arguments) == 0
     found = json.loads(capsys.readouterr().out)
     assert "prediction" not in [one["kind"] for one in found["findings"]]
-
-
-NEAR = {"deburring", "grinding"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "task",
-    [pytest.param(task, marks=[pytest.mark.thorough] * (task.stem not in NEAR)) for task in TASKS],
-    ids=lambda task: task.stem,
-)
-def test_ideal_contact_is_kept_to_a_nanometre(task, tmp_path, monkeypatch):
-    """With an integrator that is as accurate; a projection follows each of its steps."""
-    find_vendors(task, monkeypatch)
-    accurate = ["--set", "integrator.accuracy=1.0e-10", "--set", "duration=2"]
-    with warnings.catch_warnings(action="ignore", category=GeometryWarning):
-        assert main(["simulate", str(task), "--out", str(tmp_path), *BARE, *accurate]) == 0
-    record = Record.load(tmp_path / "record.npz")
-    assert abs(record["constraint_residual"]).max() < 1e-9

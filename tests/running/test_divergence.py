@@ -9,7 +9,6 @@ from runs import some
 
 from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
-from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario, roll_scenario
 from tests.support.runs import scenario
@@ -17,7 +16,7 @@ from tests.support.runs import scenario
 LATE = "sampling={period: %g, delay: %g}"
 
 
-def test_a_loop_that_diverges_ends_with_what_grew_and_since_when():
+def test_a_loop_that_diverges_ends_with_what_grew():
     """Read late: the law answers an error of long ago."""
     case = scenario("two_link_wall", "law.gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001))
     loop, context = build_scenario(case)
@@ -89,7 +88,7 @@ def unstable_inside(size, period):
 def test_when_it_ends_does_not_depend_on_units(size, period):
     """b - a = 1e-4 size e^(t / period) is 1e9 size after 13 ln 10 = 29.9 periods.
 
-    It is looked at every eighth step, of period / 50 here.
+    It is looked at every 32nd step, of period / 50 here.
     """
     loop, context = unstable_inside(size, period)
     config = SimulatorConfig(
@@ -98,35 +97,4 @@ def test_when_it_ends_does_not_depend_on_units(size, period):
     with pytest.raises(SimulationError, match=r"\bb\b") as caught:
         simulate(loop.diagram, context, 40.0 * period, config)
     expected = 13.0 * np.log(10.0)
-    assert expected <= caught.value.time / period <= expected + 9 / 50
-
-
-def test_a_control_that_leaves_all_measure_ends_a_run_whose_errors_are_small():
-    """z = x_1 is held while x_2 = tan t: just before pi / 2 it is 1e3, and u = -x_2^4 is -1e12."""
-    system = DaeSystem.from_functions(
-        ["a", "b"],
-        f=lambda x: [x[1] ** 4, x[1] ** 2 + 1.0],
-        h=lambda x: [1, 0],
-        l=lambda x: [x[0]],
-        state_scale=[1.0, 1e3],
-        name="escape",
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NonMinimumPhaseWarning)
-        law = TrackingLaw(system, poles(-2.0))
-        loop = make_closed_loop(DaePlant(system), law, {"z0": 1.0})
-    context = loop.diagram.CreateDefaultContext()
-    loop.set_state(context, [1.0, 0.0])
-    duration = np.pi / 2 - 1e-3
-    with pytest.raises(SimulationError, match="u0"):
-        simulate(loop.diagram, context, duration)
-    loop.set_state(context, [1.0, 0.0])
-    simulate(loop.diagram, context, duration, may_diverge=True)
-    record = loop.record(context)
-    assert np.max(np.abs(record["tracking_error"])) < 10.0
-    with pytest.raises(SimulationError, match="u0") as caught:
-        DivergenceWatch(loop.plant, duration).look(record, is_last=True)
-    first = np.argmax(np.abs(record["control"]) > 1e9)
-    assert caught.value.time == record.time[first]
-    # Before, a run ends by itself, and tells why.
-    DivergenceWatch(loop.plant, duration).look(record)
+    assert expected <= caught.value.time / period <= expected + 33 / 50

@@ -207,21 +207,6 @@ def test_scenario_as_run_says_all_and_needs_no_advice(tmp_path):
     assert completed.scenario == run
 
 
-def test_what_is_said_stays():
-    own = "estimator={rate: 5, friction_rate: 1}", "law.integral=[wall.force]"
-    found = chosen(two_link(*own, "law.constraint_damping={all: [-40]}"))
-    assert (found.estimator.rate, found.law.integral) == (5, ["wall.force"])
-    assert found.law.constraint_damping.all == [-40]
-
-
-@pytest.mark.parametrize("settings", ["law.gains={all: [-25]}", "plant=!IdealConstraints {}"])
-def test_gains_that_are_given_and_ideal_contact_leave_all_else_as_it_was(settings):
-    found = two_link(settings)
-    assert chosen(found) == found
-    assert found.law.integral is None
-    assert found.estimator is None
-
-
 def test_nothing_is_advised_behind_springs():
     springs = "actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]"
     found = two_link(springs, "plant=!CompliantContact {}")
@@ -259,14 +244,6 @@ def test_gains_without_a_margin_are_told():
     assert bare.scenario.law.gains == stable.scenario.law.gains
     found = find_feasibility(two_link(*sensed, "plant.stiffness=8e5"))
     assert any(re.search(r"law\.gains: .*8e\+05", problem) for problem in found.problems)
-
-
-def test_the_stiffness_of_a_patch_is_that_at_10_newtons():
-    """That this is Drake's is tested with the material."""
-    plant = "plant=!MultibodyPlant {time_step: 1.0e-3, contact_model: hydroelastic, modulus: 1.0e7}"
-    found = two_link(plant)
-    told = float(re.search(r"a contact of (\S+) N/m", advice(found).notes[0])[1])
-    assert told == pytest.approx(found.plant.stiffness_at(10.0, None), rel=0.05)  # Two digits.
 
 
 @pytest.mark.slow

@@ -2,17 +2,37 @@
 
 import numpy as np
 import pytest
-from by_inputs import parameter_names, set_inputs
 from pydrake.systems.analysis import SimulatorConfig
 from runs import run, scenario, some
 
 from drake_dae import build_scenario
+from drake_dae.blocks.compose import Leaves
+from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.scenario import build_commanded
-from drake_dae.scenario.shipped import shipped_scenarios
 
 FIXED = SimulatorConfig(
     integration_scheme="runge_kutta5", use_error_control=False, max_step_size=0.002
 )
+
+
+def parameter_names(loop):
+    """ "block.parameter" -> the block, and the place among its numeric parameters."""
+    return {
+        f"{system.get_name()}.{signal.name}": (system, i)
+        for system in Leaves.of(loop.diagram).systems
+        if isinstance(system, TracedSystem)
+        for i, signal in enumerate(system.block.signals.get("parameters", ()))
+    }
+
+
+def set_inputs(loop, context, changes):
+    """Sets the parameters in a context whose names end with those of `changes`."""
+    for ending, value in changes.items():
+        places = [p for name, p in parameter_names(loop).items() if name.endswith(ending)]
+        assert places, ending
+        for system, i in places:
+            own = system.GetMyMutableContextFromRoot(context)
+            own.get_mutable_numeric_parameter(0).SetAtIndex(i, value)
 
 
 def jumped(built, duration, **changes):
@@ -48,21 +68,3 @@ def test_errors_stay_as_predicted_whatever_is_commanded(name):
     moved = found["exogenous"][-1, 0] - found["exogenous"][0, 0]
     assert moved == pytest.approx(-0.06, abs=1e-4)
     assert np.abs(found["constraint_residual"]).max() <= 1e-6
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", shipped_scenarios())
-def test_every_shipped_scenario_is_commanded(name):
-    given = scenario(name)
-    if given.plant.carries:
-        return  # Drake's own contact.
-    built = build_commanded(given)
-    names = parameter_names(built.loop)
-    # What is left out has a reason, of which none is an error of the build.
-    assert all(": none, since " in sentence for sentence in built.left_out)
-    parts = {sentence.partition(":")[0] for sentence in built.left_out}
-    assert any(".push." in each for each in names)
-    assert "links that are pushed" not in parts
-    is_ideal = given.plant.material is None
-    is_held = is_ideal and (given.task or given.estimator) is not None
-    assert ("surfaces that are dragged" in parts) is is_held

@@ -120,12 +120,6 @@ def test_all_problems_are_told_at_once_with_their_lines():
     assert not any("\n" in text for text in found.values())
 
 
-def test_names_with_dots():
-    made = read("contact: {surface: {}}", "free.a.b={c: 1}", "free.d={}")
-    assert made.free == {"a.b": {"c": 1}, "d": {}}
-    assert read("contact: {surface: {}}\nfree: {a.b: {}}", "free.a.b.c=2").free["a.b"] == {"c": 2}
-
-
 def test_what_differs_from_the_defaults_is_written_and_reads_back():
     made = read(
         "contact: {surface: !Funnel {apex: [1, 2, 3]}, names: [a, 'on', '1e5', 'é: 1']}\n"
@@ -139,24 +133,6 @@ def test_what_differs_from_the_defaults_is_written_and_reads_back():
     np.testing.assert_array_equal(again.spring.stiffness, made.spring.stiffness)
     arrays = Everything(Contact(Bowl()), Spring(np.eye(2), geometry=np.array([1.0, 2.0])))
     assert READER.write(arrays)["spring"] == {"stiffness": [[1, 0], [0, 1]], "geometry": [1, 2]}
-
-
-def test_merged_keys_and_aliases():
-    text = "contact: {surface: &bowl {depth: 3}}\nfree:\n  a: &one {x: 1}\n  b: {<<: *one, y: 2}"
-    assert read(text).free == {"a": {"x": 1}, "b": {"x": 1, "y": 2}}
-
-
-@pytest.mark.parametrize("text", ["free: &x {a: *x}", "free: &x [*x]", "contact: &x !Y {a: *x}"])
-def test_an_alias_inside_itself_is_refused(text):
-    assert problems(text)
-
-
-def test_the_json_schema_has_defaults_and_no_tags():
-    parts = READER.schema["$defs"]
-    assert parts["Config"]["properties"]["accuracy"]["default"] == 0.25
-    assert parts["Config"]["properties"]["step"]["description"] == "How far."
-    assert READER.tags == ["!Bowl", "!Funnel"]
-    assert "_tag" not in str(READER.schema)
 
 
 def test_every_form_and_key_is_on_the_page_of_keys_with_its_meaning():

@@ -2,22 +2,18 @@
 
 import json
 import re
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 from arms import numbers, parse
-from found_places import found_off
 from numpy.testing import assert_allclose
-from runs import scenario, some
-from scenario_texts import OBSERVED, SHORT, task_text, written
+from runs import some
+from scenario_texts import OBSERVED, task_text, written
 
-from drake_dae import Record, build_scenario, load_scenario, rollout, shipped_model
+from drake_dae import Record, build_scenario, load_scenario
 from drake_dae.cli import main
 from drake_dae.diagrams.record import phase_spans
 from drake_dae.errors import ScenarioError
-from drake_dae.running import start_values
 from drake_dae.scenario.build import build_completed, roll_scenario
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.start import start_scenario
@@ -93,21 +89,6 @@ def test_a_touch_lasts_up_to_the_computed_speed(file, mass):
 
     assert least_force(computed) > 0.0
     assert least_force(4.0 * computed) == 0.0
-
-
-def test_a_task_does_not_start_outside_of_limits(tmp_path):
-    """A joint stands at 0 where nothing is said of it."""
-    urdf = Path(shipped_model("two_link_arm.urdf")).read_text()
-    limits = 'lower="-3.1416" upper="3.1416"'
-    assert limits in urdf
-    (tmp_path / "bent.urdf").write_text(urdf.replace(limits, 'lower="0.5" upper="3.1416"'))
-    words = SHORT.replace("package://drake_dae_models/two_link_arm.urdf", "bent.urdf")
-    file = tmp_path / "bent.yaml"
-    file.write_text(words)
-    build_scenario(load_scenario(file))
-    file.write_text(words.replace("joint1: 1.1653, ", ""))
-    with pytest.raises(ScenarioError, match=r"start: .*joint1 = 0 rad"):
-        build_scenario(load_scenario(file))
 
 
 MOVING = """
@@ -332,48 +313,3 @@ def test_gains_of_a_task_are_advised(observed, told):
     assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < [2e-5, 0.05])
     peak = float(summary.split("A touch at 0.03 m/s is expected to stay below ")[1].split(" N")[0])
     assert 0.3 * peak < np.max(found["constraint_force"][found.time < 1.0]) < peak
-
-
-DURATION = 12.1  # Until the part is polished.
-PLACE = "part.position: [0.703, 0.003, 0.6026], part.rpy: [0.03, 0.06, -0.056]"  # As in the file.
-BALL = f"plant=!CompliantContact {{friction: 0.3, radius: 0.01, parameters: {{{PLACE}}}}}"
-
-
-def polished(*settings):
-    """The scenario, its loop, and record and starts of phases of a rollout."""
-    chosen = scenario("polish_unknown_part", *settings, f"duration={DURATION}")
-    loop, context = build_scenario(chosen)
-    times = np.linspace(0.0, DURATION, round(1000 * DURATION) + 1)
-    (run,) = rollout(loop, *start_values(loop, context), times)
-    assert run.failure is None, run.failure
-    changes = {change.phase: change.time for change in loop.changes(run.record)}
-    return chosen, loop, run.record, changes
-
-
-@pytest.mark.slow
-@pytest.mark.thorough
-def test_a_part_5_mm_and_5_degrees_off_is_found_and_polished():
-    """The place is that of the surface under the way of the tool, by the estimates at each time.
-
-    At the first touch it is off by some mm; 0.1 mm is asked after the part is felt.
-    """
-    chosen, loop, record, changes = polished(BALL)
-    assert list(changes)[:5] == ["Move", "Approach", "Press", "feel", "polish"]
-    begin, end = changes["polish"], DURATION
-    rows = np.flatnonzero((record.time > begin) & (record.time < end))[::50]
-    off = partial(found_off, chosen, loop, record, rows)
-    before = off(np.searchsorted(record.time, changes["Press"]))
-    assert np.abs(before).max() > 5e-3  # Where the law has the part.
-    every = np.array([off(at) for at in rows])
-    assert np.sqrt(np.mean(every**2)) < 1e-4
-    # The force, after the transition of a second, and the tool beside the normal, in rad.
-    late = (record.time > begin + 1.0) & (record.time < end)
-    errors = dict(
-        zip(
-            [signal.name for signal in record.signals["tracking_error"].signals],
-            record["tracking_error"][late].T,
-            strict=True,
-        )
-    )
-    assert np.sqrt(np.mean(errors["part.force"] ** 2)) < 0.05
-    assert np.sqrt(np.mean(errors["part.tilt_x"] ** 2 + errors["part.tilt_y"] ** 2)) < 3e-3

@@ -81,26 +81,20 @@ def with_script(page: str, body: str) -> str:
     return before + script + mark + after
 
 
+def dumped(address: str, *flags: str) -> str:
+    """The text of a page when its virtual time is over, in a profile of its own."""
+    with tempfile.TemporaryDirectory() as profile:
+        command = [CHROMIUM, *OPTIONS, f"--user-data-dir={profile}", *flags, "--dump-dom", address]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert done.stdout, f"the page has no text: {done.stderr[-2000:]}"
+    return done.stdout
+
+
 def in_page(page: str, body: str, file: Path, width: int = 1000, height: int = 700):
-    """What a script returns in a page that is opened from file://.
-
-    Args:
-        page: The text of the page.
-        body: As of `with_script`.
-        file: Where the page with the script is written.
-        width, height: The size of the window, in pixels.
-    """
+    """What a script, as of `with_script`, returns in a page that is written to a file."""
     file.write_text(with_script(page, body), encoding="utf-8")
-    return opened(file.as_uri(), file.parent / "profile", width, height)
-
-
-def opened(address: str, profile: Path, width: int = 1000, height: int = 700):
-    """What the script of a page returns that Chromium opens, in virtual time."""
-    more = f"--window-size={width},{height}", f"--user-data-dir={profile}", BUDGET
-    command = [CHROMIUM, *OPTIONS, *more, "--dump-dom", address]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
-    found = _RESULT.search(done.stdout)
-    assert found, f"the page has no result: {done.stderr[-2000:]}"
+    found = _RESULT.search(dumped(file.as_uri(), f"--window-size={width},{height}", BUDGET))
+    assert found, "the page has no result"
     result = json.loads(unescape(found[1]))
     assert not (isinstance(result, dict) and "failed" in result), result
     return result
@@ -142,9 +136,8 @@ def shown(
     head, end, tail = text.rpartition("</body>")
     copy = page.with_name(f"told-{page.name}")
     copy.write_text(f"{head}{told}{end}{tail}", "utf-8")
-    with tempfile.TemporaryDirectory() as user:
-        command = [CHROMIUM, *OPTIONS, *flags, f"--user-data-dir={user}", f"--window-size={size}"]
-        command += ["--virtual-time-budget=8000", "--dump-dom", copy.as_uri() + fragment]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True)
-    (found,) = re.findall(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)
+    text = dumped(
+        copy.as_uri() + fragment, *flags, f"--window-size={size}", "--virtual-time-budget=8000"
+    )
+    (found,) = re.findall(r'<pre id="told">(.*?)</pre>', text, re.DOTALL)
     return found

@@ -16,7 +16,8 @@ LAST = 83
 
 _NUMBERS = re.compile(r"# \(\d+\)(?:(?:, |-)\(\d+\))*$")
 
-_ROBOT = "for the robot (43)-(45) a special case of"
+_ROBOT = dict.fromkeys((46, 47, 48, 49), "(9)-(12)") | dict.fromkeys((50, 51, 52, 53), "(21)")
+_ROBOT |= {42: "(4) with r = 2", 54: "(26)", 55: "(26)", 56: "(26)", 57: "(25)"}
 
 WITHOUT_LINE = {
     5: "the form of a feedback; (28) is the one that is used",
@@ -28,32 +29,12 @@ WITHOUT_LINE = {
     19: "follows from (10) and (14); nothing computes it",
     23: "the derivative of (20) along (1); (26) is what is left of it on N*",
     33: "follows from (30) and (32)",
-    42: f"{_ROBOT} (4) with r = 2",
-    46: f"{_ROBOT} (9)",
-    47: f"{_ROBOT} (11)",
-    48: f"{_ROBOT} (10)",
-    49: f"{_ROBOT} (12)",
-    50: f"{_ROBOT} (21)",
-    51: f"{_ROBOT} (21)",
-    52: f"{_ROBOT} (21)",
-    53: f"{_ROBOT} (21)",
-    54: f"{_ROBOT} (26)",
-    55: f"{_ROBOT} (26)",
-    56: f"{_ROBOT} (26)",
-    57: f"{_ROBOT} (25)",
+    **{k: f"for the robot (43)-(45) a special case of {what}" for k, what in _ROBOT.items()},
     61: "what (59) leaves of the force error; nothing computes it",
     62: "(29) of the positions",
     63: "(29) of the forces",
-    66: "(38), whatever drives the joints",
-    67: "(39), whatever drives the joints",
-    68: "(40), whatever drives the joints",
-    69: "(28) of the chain of joints and springs",
-    70: "ubar of (28) of the chain of joints and springs",
-    76: "(38), whatever drives the joints",
-    77: "(39), whatever drives the joints",
-    78: "(40), whatever drives the joints",
-    79: "(28) of the chain of joints and motors",
-    80: "ubar of (28) of the chain of joints and motors",
+    **dict.fromkeys((66, 67, 68, 76, 77, 78), "(38)-(40), whatever drives the joints"),
+    **dict.fromkeys((69, 70, 79, 80), "(28) and ubar of the chain of joints, springs and motors"),
 }
 """Why no line computes an equation."""
 

@@ -38,21 +38,9 @@ MANY_PIECES = (
 """A setting of the two links on a wall: a path of 1,000 polynomials, which are in a table."""
 
 DEAR = (
-    "three_fingers",
-    "seven_joint_flexible_motors",
-    "planar_4rrr",
-    "biped",
-    "conveyor",
-    "crank_turning",
-    "four_bar",
-    "planar_3rrr",
-    "seven_joint_dome",
-    "seven_joint_flexible",
-    "seven_joint_pipe",
-    "slider_crank",
-    "stewart_platform",
-    "two_arms",
-    "two_arms_free_box",
+    *("three_fingers", "seven_joint_flexible_motors", "planar_4rrr", "biped", "conveyor"),
+    *("crank_turning", "four_bar", "planar_3rrr", "seven_joint_dome", "seven_joint_flexible"),
+    *("seven_joint_pipe", "slider_crank", "stewart_platform", "two_arms", "two_arms_free_box"),
     "two_link_flexible",
 )
 """Scenarios that show nothing which cheaper ones do not, where code is made of all of them."""
@@ -94,15 +82,12 @@ def some(
     """
     found = []
     for i, case in enumerate(cases):
-        given = case if isinstance(case, ParameterSet) else _case(case)
+        values = case if isinstance(case, tuple) else (case,)
+        given = case if isinstance(case, ParameterSet) else pytest.param(*values)
         left_out = i % of != first or given.values[0] in dear
         marks = [*given.marks, *[pytest.mark.thorough] * left_out]
         found.append(pytest.param(*given.values, marks=marks, id=given.id))
     return found
-
-
-def _case(case: Any) -> ParameterSet:
-    return pytest.param(*case) if isinstance(case, tuple) else pytest.param(case)
 
 
 def first_quick(cases: Iterable[Any]) -> list[ParameterSet]:

@@ -85,7 +85,7 @@ int ${prefix}_loop_advance(Loop *l, double time) {
   if (l->has_begun && time <= l->time) return ${guard}_OK;
   if (!l->has_begun) begin_run(l);
   for (;;) {
-    double moments[MANY], trial[SIZE], end = time;
+    double moments[MANY], end = time;
     long long due[MANY], first = 0;
     Run run;
     Batch batch;
@@ -97,7 +97,7 @@ int ${prefix}_loop_advance(Loop *l, double time) {
     batch.num_runs = batch.num_rows = 1;
     batch.states = l->state, batch.held = l->held, batch.parameters = l->parameters;
     batch.times = &end, batch.events = moments, batch.due = due;
-    batch.rows = (double *)&l->outputs, batch.trials = trial;
+    batch.rows = (double *)&l->outputs;
     batch.longest = l->longest;
     batch.stages = $stages;
     batch.a = a, batch.b = b, batch.c = c;

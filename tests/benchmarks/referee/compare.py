@@ -1,49 +1,42 @@
 """Engines beside the reference, as correct digits."""
 
 import importlib
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
 from referee.derive import balance, exact, frames
 from referee.description import Mechanism, force_names
-from referee.reference import Lines
+from referee.engines import ours
+from referee.reference import MOTIONS, STATES, Lines, load
+from referee.spatial import MECHANISMS
 
 ENGINES = ("ours", "drake_joints", "mujoco_engine", "pinocchio_engine")
-"""The modules of `engines`: NAME, NOTE, `forces`, and where it has one `mass_matrix`, `after`."""
-
-MOST = 16
-"""The digits of a double."""
+"""The modules of `engines`: NAME, NOTE and `forces`; of a soft one also `mass_matrix`."""
 
 SAME_MODEL = 1e-12
 """The largest relative difference of a mass matrix from the reference's."""
 
+HEAD = """# Constraint forces of mechanisms: correct digits
 
-@dataclass(frozen=True)
-class Cell:
-    """What one engine makes of one mechanism.
+Made by `make table NAME=referee`. Each number is -log10 of the largest error of all
+constraint forces of the mechanism, in the size of the largest one, rounded down; doubles
+hold 15 or 16.
+What each engine solves, at the best settings found:
+"""
 
-    Attributes:
-        digits: The correct digits of its forces; None if it cannot tell.
-        reason: Why not.
-    """
+MOVED = "least digits of forces, positions and rates"
 
-    digits: float | None = None
-    reason: str = ""
-
-    def __str__(self) -> str:
-        return "-" if self.digits is None else str(int(self.digits))
+Cell = float | str
+"""The correct digits of an engine's forces, 0 to 16, or why it cannot tell."""
 
 
 def correct_digits(found: Sequence[float], wanted: Sequence[float]) -> float:
     """-log10 of the largest error in the size of the largest value; 0 to 16."""
     error = np.max(np.abs(np.subtract(found, wanted))) / np.max(np.abs(wanted))
-    if not math.isfinite(error):
-        return 0.0
-    return float(np.clip(-np.log10(max(error, 1e-300)), 0.0, MOST))
+    return float(np.clip(-np.log10(max(error, 1e-300)), 0.0, 16.0)) if np.isfinite(error) else 0.0
 
 
 def state_of(mechanism: Mechanism, lines: Lines) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +56,7 @@ def stacked(mechanism: Mechanism, forces: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate([forces[closure.name] for closure in mechanism.closures])
 
 
-def find_engines(names: Sequence[str] = ENGINES) -> tuple[list[ModuleType], list[str]]:
+def find_engines(names: Sequence[str]) -> tuple[list[ModuleType], list[str]]:
     """The engines that are installed, and a sentence for each that is not."""
     found, missing = [], []
     for name in names:
@@ -75,73 +68,63 @@ def find_engines(names: Sequence[str] = ENGINES) -> tuple[list[ModuleType], list
 
 
 def compare_state(engine: ModuleType, mechanism: Mechanism, lines: Lines) -> Cell:
-    """The digits of an engine's forces at the stated state."""
+    """An engine's forces at the stated state."""
     q, v = state_of(mechanism, lines)
     try:
         found = stacked(mechanism, engine.forces(mechanism, q, v))
     except NotImplementedError as error:
-        return Cell(None, str(error))
+        return str(error)
     if hasattr(engine, "mass_matrix"):
         M, _ = balance(mechanism, frames(mechanism, exact(q), exact(0 * v)))
         wanted = np.array(M, dtype=float)
         apart = np.max(np.abs(engine.mass_matrix(mechanism, q, v) - wanted))
         if apart > SAME_MODEL * np.max(np.abs(wanted)):
-            return Cell(None, f"its mass matrix differs by {apart:.1g}: another model")
-    return Cell(correct_digits(found, wanted_forces(mechanism, lines)))
+            return f"its mass matrix differs by {apart:.1g}: another model"
+    return correct_digits(found, wanted_forces(mechanism, lines))
 
 
-def compare_motion(engine: ModuleType, mechanism: Mechanism, start: Lines, end: Lines) -> Cell:
-    """The digits of an engine's forces after the motion; the least of those of q and v, if any."""
-    if not hasattr(engine, "after"):
-        return Cell(None, "it has no integrator of constrained motion")
-    try:
-        found = engine.after(mechanism, *state_of(mechanism, start))
-    except NotImplementedError as error:
-        return Cell(None, str(error))
-    except (RuntimeError, ValueError) as error:  # The other mechanisms go on.
-        return Cell(None, f"it fails with {str(error).splitlines()[0]!r}")
-    q, v = state_of(mechanism, end)
+def compare_motion(mechanism: Mechanism, start: Lines, end: Lines) -> float:
+    """The least of our digits of forces, q and v after the motion."""
+    found = ours.after(mechanism, *state_of(mechanism, start))
     parts = [(stacked(mechanism, found), wanted_forces(mechanism, end))]
-    parts += [(found[key], value) for key, value in (("q", q), ("v", v)) if key in found]
-    return Cell(min(correct_digits(*part) for part in parts))
+    parts += zip((found["q"], found["v"]), state_of(mechanism, end), strict=True)
+    return min(correct_digits(*part) for part in parts)
 
 
-def table(
-    title: str, engines: Sequence[ModuleType], cells: dict[str, dict[str, Cell]]
-) -> list[str]:
-    """One table of digits, and why there is a '-', as lines of Markdown."""
-    heads = [engine.NAME for engine in engines]
-    lines = ["| " + " | ".join([title, *heads]) + " |", "|" + "---|" * (len(heads) + 1)]
+def table(title: str, heads: Sequence[str], cells: dict[str, dict[str, Cell]]) -> str:
+    """One table of digits, and why there is a '-', in Markdown."""
+    rows = [[title, *heads], ["---"] * (len(heads) + 1)]
+    reasons: dict[tuple[str, str], list[str]] = {}
     for name, row in cells.items():
-        lines.append("| " + " | ".join([name, *(str(row[head]) for head in heads)]) + " |")
-    lines += ["", "Why there is a '-':\n"]
-    for head in heads:
-        reasons: dict[str, list[str]] = {}
-        for name, row in cells.items():
-            if row[head].reason:
-                reasons.setdefault(row[head].reason, []).append(name)
-        lines += [f"- {head}, {', '.join(who)}: {why}." for why, who in reasons.items()]
-    return [*lines, ""]
+        rows.append([name, *("-" if isinstance(c, str) else str(int(c)) for c in row.values())])
+        for head, cell in row.items():
+            if isinstance(cell, str):
+                reasons.setdefault((head, cell), []).append(name)
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    lines += ["", "Why there is a '-':", ""] if reasons else []
+    lines += [f"- {head}, {', '.join(who)}: {why}." for (head, why), who in reasons.items()]
+    return "\n".join([*lines, ""])
 
 
-def page(
-    engines: Sequence[ModuleType],
-    states: dict[str, dict[str, Cell]],
-    motions: dict[str, dict[str, Cell]],
-    missing: Sequence[str],
-) -> str:
-    """The tables, and what each engine solves, in Markdown."""
-    lines = [
-        "# Constraint forces of mechanisms: correct digits\n",
-        "Made by `make table NAME=referee`. Each number is -log10 of the largest error of all",
-        "constraint forces of the mechanism, in the size of the largest one, rounded down; doubles",
-        "hold 15 or 16. What each engine solves, at the best settings found:\n",
-        *(f"- **{engine.NAME}**: {engine.NOTE}." for engine in engines),
-        *(f"- {sentence}" for sentence in missing),
-        "\n## At the stated state\n",
-        *table("mechanism", engines, states),
-        "## After the motion\n",
-        "The digits of forces; for drake_dae the least of forces, positions and rates.\n",
-        *table("mechanism, s", engines, motions),
-    ]
-    return "\n".join(lines)
+def main(names: Sequence[str]) -> None:
+    """Compares some mechanisms, or all; then the page is written."""
+    if unknown := [name for name in names if name not in MECHANISMS]:
+        raise SystemExit(f"no mechanism {', '.join(unknown)}; there are {', '.join(MECHANISMS)}")
+    engines, missing = find_engines(ENGINES)
+    start, end = load(STATES), load(MOTIONS)
+    states, motions = {}, {}
+    for name in names or MECHANISMS:
+        mechanism = MECHANISMS[name]
+        states[name] = {e.NAME: compare_state(e, mechanism, start) for e in engines}
+        if name in end:
+            digits = compare_motion(mechanism, start, end)
+            motions[f"{name}, {mechanism.duration:g} s"] = {MOVED: digits}
+        print(name, "is compared", flush=True)
+    notes = [f"- **{engine.NAME}**: {engine.NOTE}." for engine in engines]
+    heads = [engine.NAME for engine in engines]
+    found = "## At the stated state\n\n" + table("mechanism", heads, states)
+    after = "## drake_dae after a motion\n\n" + table("mechanism, s", [MOVED], motions)
+    text = "\n".join([HEAD, *notes, *(f"- {sentence}" for sentence in missing), "", found, after])
+    print("\n" + text)
+    if not names:
+        Path(__file__).with_name("table.md").write_text(text)

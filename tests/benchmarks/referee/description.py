@@ -1,7 +1,8 @@
 """The plain description of a mechanism, from which each engine's model and the reference are made.
 
 All frames of bodies are parallel to the world's where the positions are zero; so a mechanism is
-points, axes and numbers alone. Each number is exactly its decimal: 0.3 means 3/10.
+points, axes and numbers alone. Each number is exactly its decimal: 0.3 means 3/10. Units are m,
+rad, s, kg, N.
 """
 
 from collections.abc import Mapping
@@ -20,14 +21,9 @@ FREE = (("slide", X), ("slide", Y), ("slide", Z), ("turn", Z), ("turn", Y), ("tu
 class Body:
     """A rigid body that joints, one after the other, connect to its parent.
 
-    Attributes:
-        name: Its name.
-        joints: Kind, "turn" or "slide", and unit axis of each joint from the parent outward.
-        parent: The name of its parent.
-        at: The origin of the body in its parent where its joints are at zero, m.
-        mass: In kg; 0 only for a body that carries another one.
-        center: The center of mass, m.
-        inertia: The principal inertias about the center, along the body's axes, kg m^2.
+    Joints are kind, "turn" or "slide", and unit axis, from the parent outward; `at` is the origin
+    of the body in its parent where they are at zero. A body without mass carries another one. The
+    inertia has the principal ones about the center of mass, along the body's axes.
     """
 
     name: str
@@ -45,18 +41,16 @@ class Closure:
 
     Its force is what body A exerts on body B at point B, in the axes of the world:
 
-    - "point": the points coincide along `axes`; the force along these axes, N.
+    - "point": the points coincide along `axes`; the force along these axes.
     - "weld": frames at both points, parallel to the world's where positions are zero, coincide;
-      moment, N m, and force, N.
+      moment and force.
     - "hinge": the points coincide, and the `direction` of both bodies; moment and force.
-    - "distance": the points have the distance `size`; the force in the rod, N, positive if it
-      pushes.
+    - "distance": the points have the distance `size`; the force in the rod, positive if it pushes.
     - "plane": point B is in the plane through A with the normal `direction`, fixed in the world,
-      with Coulomb's `friction` while it slides; the force with its friction, N. The plane may move
-      along its normal, with `road`: its velocity, m/s, and acceleration, m/s^2, at the stated time.
-    - "ball": a ball of the radius `size` with the center B rolls on that plane; the force, N.
+      with Coulomb's `friction` while it slides; the force with its friction. The plane may move
+      along its normal, with `road`: its velocity and acceleration at the stated time.
     - "gear": the position of `body_b` is `size` times that of `body_a` (one joint each); the moment
-      on body B, N m, which gives `size` times the opposite on A.
+      on body B, which gives `size` times the opposite on A.
     """
 
     name: str
@@ -74,12 +68,7 @@ class Closure:
 
 @dataclass(frozen=True)
 class Spring:
-    """A linear spring between points of two bodies.
-
-    Attributes:
-        stiffness: In N/m.
-        length: Its length without force, m.
-    """
+    """A linear spring between points of two bodies, and its length without force."""
 
     body_a: str
     point_a: Vector
@@ -91,24 +80,14 @@ class Spring:
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A mechanism in a stated state.
+    """A mechanism in a stated state; joints are numbered in the order of the bodies.
 
-    Attributes:
-        name: Its name.
-        bodies: The bodies, each after its parent.
-        closures: The constraints.
-        q: The position of each joint, rad or m. Those of `free` joints are exact, the others
-            guesses from which Newton's method starts.
-        v: Free joint -> its rate, rad/s or m/s; zero if not named.
-        free: The numbers of the joints whose rates determine all rates.
-        placed: The numbers of the joints whose positions determine all positions: `free` if None.
-            They are more if the constraint is nonholonomic.
-        gravity: m/s^2.
-        torques: Number of a joint -> the torque or force in it, N m or N.
-        springs: The springs.
-        split: How redundant forces are split, as text; empty if they are not redundant.
-        duration: How long the motion lasts after which the forces are compared again, s; 0 for
-            none.
+    Each body stands after its parent. Of `q` the positions of `free` joints are exact, the others
+    guesses from which Newton's method starts; `v` has the rates of free joints that are not zero.
+    The rates of the free joints determine all rates; those `placed` determine all positions, and
+    are more than the free ones if the constraint is nonholonomic. `torques` act in joints. If
+    forces are redundant, `split` says how they are split. After `duration`, if it is not zero, the
+    forces are compared again.
     """
 
     name: str
@@ -129,10 +108,6 @@ class Mechanism:
         """The number of joints."""
         return sum(len(body.joints) for body in self.bodies)
 
-    def body(self, name: str) -> Body:
-        """The body of that name."""
-        return next(body for body in self.bodies if body.name == name)
-
     def first_joint(self, name: str) -> int:
         """The number of the first joint of a body."""
         before = self.bodies[: [body.name for body in self.bodies].index(name)]
@@ -141,13 +116,13 @@ class Mechanism:
 
 def force_names(closure: Closure) -> list[str]:
     """The names of the components of a closure's force."""
+    force, moment = ["fx", "fy", "fz"], ["mx", "my", "mz"]
     kinds = {
         "point": [f"f{axis}" for axis in closure.axes],
-        "weld": ["mx", "my", "mz", "fx", "fy", "fz"],
-        "hinge": ["mx", "my", "mz", "fx", "fy", "fz"],
+        "weld": moment + force,
+        "hinge": moment + force,
         "distance": ["thrust"],
-        "plane": ["fx", "fy", "fz"],
-        "ball": ["fx", "fy", "fz"],
+        "plane": force,
         "gear": ["moment"],
     }
     return [f"{closure.name}.{name}" for name in kinds[closure.kind]]

@@ -3,7 +3,6 @@
 from referee.description import PLANAR, Body, Closure, Mechanism, Spring
 
 DOWN = (0.0, -9.81, 0.0)
-LEAST = "least sum of squares of all forces, N^2"
 
 
 def rod(name: str, length: float, mass: float, **where: object) -> Body:
@@ -57,27 +56,6 @@ FOUR_BAR = Mechanism(
     gravity=DOWN,
     torques={0: 0.5},
     duration=0.5,
-)
-
-
-PARALLEL_BARS = Mechanism(
-    "parallel_bars",
-    (
-        rod("first", 1.0, 1.0),
-        rod("beam", 2.0, 2.0, parent="first", at=(1.0, 0.0, 0.0)),
-        rod("second", 1.0, 1.0, at=(1.0, 0.0, 0.0)),
-        rod("third", 1.0, 1.0, at=(2.0, 0.0, 0.0)),
-    ),
-    (
-        pin("middle", "second", (1.0, 0.0), "beam", (1.0, 0.0)),
-        pin("end", "third", (1.0, 0.0), "beam", (2.0, 0.0)),
-    ),
-    q=(-2.0, 2.0, -2.0, -2.0),
-    v={0: -1.0},
-    free=(0,),
-    gravity=DOWN,
-    split=LEAST,
-    duration=0.2,
 )
 
 # Andrews' squeezer: the numbers of the Test Set for IVP Solvers; without gravity.
@@ -165,4 +143,4 @@ CAR_AXIS = Mechanism(
     ),
 )  # fmt: skip
 
-PLANAR_MECHANISMS = (PENDULUM, TWO_RODS, FOUR_BAR, PARALLEL_BARS, SQUEEZER, SLIDING_ROD, CAR_AXIS)
+PLANAR_MECHANISMS = (PENDULUM, TWO_RODS, FOUR_BAR, SQUEEZER, SLIDING_ROD, CAR_AXIS)

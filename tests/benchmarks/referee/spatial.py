@@ -73,83 +73,6 @@ BRICARD = Mechanism(
     duration=0.1,
 )  # fmt: skip
 
-LEGS = (
-    ((0.5, 0.1, 0.0), (0.22, 0.14, 0.0)), ((0.34, 0.38, 0.0), (0.02, 0.26, 0.0)),
-    ((-0.16, 0.48, 0.0), (-0.04, 0.25, 0.0)), ((-0.5, 0.2, 0.0), (-0.23, 0.12, 0.0)),
-    ((-0.3, -0.4, 0.0), (-0.2, -0.15, 0.0)), ((0.28, -0.42, 0.0), (0.19, -0.18, 0.0)),
-)  # fmt: skip
-LEG_GUESSES = ((0.0, -0.3, 0.8), (0.1, -0.3, 0.8), (0.2, 0.1, 0.8), (0.1, 0.3, 0.8),
-               (-0.2, 0.1, 0.8), (-0.2, -0.1, 0.8))  # fmt: skip
-
-
-def leg(i: int) -> tuple[Body, Body]:
-    """A cylinder on a universal joint, and its piston, whose origin is its tip."""
-    base = LEGS[i][0]
-    return (
-        Body(f"cylinder{i}", (("turn", X), ("turn", Y)), "world", base, 1.1, (0.0, 0.0, 0.2),
-             (0.015, 0.015, 0.001)),
-        Body(f"piston{i}", (("slide", Z),), f"cylinder{i}", (0.0, 0.0, 0.0), 0.6,
-             (0.0, 0.0, -0.2), (0.008, 0.008, 0.0003)),
-    )  # fmt: skip
-
-
-STEWART = Mechanism(
-    "stewart",
-    (
-        Body("platform", FREE, mass=8.0, center=(0.01, -0.02, 0.05), inertia=(0.2, 0.25, 0.4)),
-        *(body for i in range(6) for body in leg(i)),
-    ),
-    tuple(
-        Closure(f"ball{i}", "point", f"piston{i}", (0.0, 0.0, 0.0), "platform", LEGS[i][1])
-        for i in range(6)
-    ),
-    q=(0.05, -0.03, 0.75, 0.2, 0.1, -0.15, *(part for guess in LEG_GUESSES for part in guess)),
-    v={0: 0.3, 1: -0.2, 2: 0.1, 3: 0.5, 4: -0.4, 5: 0.6},
-    free=(0, 1, 2, 3, 4, 5),
-    torques={8: 20.0, 11: 25.0, 14: 15.0, 17: 30.0, 20: 10.0, 23: 22.0},
-)
-
-SIDES = ((1.0, 0.0), (-0.6, 0.8), (-0.6, -0.8))
-"""Horizontal unit vectors; the arms of the delta robot reach along them."""
-
-
-def delta_arm(i: int) -> Body:
-    """An upper arm, which turns about the horizontal across its side."""
-    x, y = SIDES[i]
-    shoulder, center = ((round(r * x, 4), round(r * y, 4), 0.0) for r in (0.2, 0.15))
-    joint = (("turn", (-y, x, 0.0)),)
-    return Body(f"arm{i}", joint, "world", shoulder, 0.5, center, (0.004, 0.004, 0.004))
-
-
-def delta_rods(i: int) -> tuple[Closure, Closure]:
-    """The two rods of a forearm, 0.1 m apart, without mass."""
-    x, y = SIDES[i]
-    found = []
-    for name, s in (("left", 0.05), ("right", -0.05)):
-        elbow, wrist = (
-            (round(r * x - s * y, 4), round(r * y + s * x, 4), 0.0) for r in (0.3, 0.06)
-        )
-        found.append(
-            Closure(f"{name}{i}", "distance", f"arm{i}", elbow, "platform", wrist, size=0.6)
-        )
-    return found[0], found[1]
-
-
-DELTA = Mechanism(
-    "delta",
-    (
-        Body("platform", FREE, mass=0.7, center=(0.0, 0.02, -0.03),
-             inertia=(0.001, 0.0012, 0.002)),
-        *(delta_arm(i) for i in range(3)),
-    ),
-    tuple(rod for i in range(3) for rod in delta_rods(i)),
-    q=(0.05, 0.04, -0.45, 0.0, 0.0, 0.0, 0.3, 0.3, 0.3),
-    v={0: 0.6, 1: -0.4, 2: 0.3},
-    free=(0, 1, 2),
-    torques={6: -2.0, 7: -1.5, 8: -1.0},
-    duration=0.05,
-)  # fmt: skip
-
 ARM_AXES = (Z, Y, Y, X, Y, X)
 ARM_LENGTHS = (0.3, 0.4, 0.35, 0.1, 0.1, 0.05)
 ARM_MASSES = (4.0, 3.0, 2.5, 1.0, 0.8, 0.3)
@@ -226,17 +149,6 @@ TABLE = Mechanism(
     split="least sum of squares of the normal forces, N^2: legs of equal stiffness",
 )
 
-ROLLING_BALL = Mechanism(
-    "rolling_ball",
-    (Body("ball", FREE, mass=0.9, center=(0.01, 0.02, -0.04), inertia=(0.004, 0.005, 0.006)),),
-    (Closure("ground", "ball", "world", (0.0, 0.0, 0.0), "ball", (0.0, 0.0, 0.0), size=0.12),),
-    q=(0.0, 0.0, 0.12, 0.4, 0.3, -0.5),
-    v={3: 1.0, 4: 2.5, 5: -1.5},
-    free=(3, 4, 5),
-    placed=(0, 1, 3, 4, 5),
-    duration=0.1,
-)
-
 GEARS = Mechanism(
     "gears",
     (
@@ -262,17 +174,6 @@ GEARS = Mechanism(
 
 MECHANISMS = {
     mechanism.name: mechanism
-    for mechanism in (
-        *PLANAR_MECHANISMS,
-        TOP,
-        BRICARD,
-        STEWART,
-        DELTA,
-        TWO_ARMS,
-        HUMANOID,
-        TABLE,
-        ROLLING_BALL,
-        GEARS,
-    )
+    for mechanism in (*PLANAR_MECHANISMS, TOP, BRICARD, TWO_ARMS, HUMANOID, TABLE, GEARS)
 }
 """All mechanisms of the referee, by name."""

@@ -31,7 +31,6 @@ from scipy.linalg import expm
 from drake_dae import rollout
 from drake_dae.errors import ModelError
 from drake_dae.running import export_loop, start_values
-from drake_dae.running import rollout as module
 from drake_dae.running.rollout_program import events_within, program_of
 
 
@@ -307,18 +306,6 @@ def test_a_diagram_is_compiled_once():
     first, other = random_diagram(0)[0], random_diagram(0)[0]
     assert program_of(first) is program_of(first)
     assert program_of(first) is not program_of(other)
-
-
-def test_a_stiff_rollout_says_so(monkeypatch):
-    """A decay at 2000 1/s: its steps are some 3 ms for ever, whatever the accuracy."""
-    monkeypatch.setattr(module, "MANY", 500)
-    builder = DiagramBuilder()
-    system = builder.AddSystem(LinearSystem([[-2e3]], np.zeros((1, 0)), np.eye(1)))
-    builder.ExportOutput(system.get_output_port(), "x")
-    diagram = builder.Build()
-    config = SimulatorConfig(accuracy=1e-3)
-    with pytest.warns(UserWarning, match=r"2e\+03 1/s"):
-        rollout(diagram, [1.0], None, [0.0, 3.0], config=config, compiled=False)
 
 
 def test_updates_at_rows_have_their_times():

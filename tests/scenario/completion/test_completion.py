@@ -12,6 +12,7 @@ from runs import run_scenario, scenario, scenario_model
 from drake_dae import (
     CircleReference,
     ConstantReference,
+    ForceCombination,
     JointPositions,
     PointCoordinates,
     build_scenario,
@@ -132,6 +133,13 @@ def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_k
         ),
         ({"references": {f"joint{k}": 0.0 for k in range(1, 8)}}, "references: joint1"),
         ({"references": {"tol.y": 0.0, "wall.force": FORCE}}, "references.tol.y: "),
+        (
+            {
+                "forces": ["wall.force", ForceCombination({"wall.force": 2.0}, "twice")],
+                "references": {"wall.force": 10.0, "twice": 20.0},
+            },
+            "forces: wall.force, twice .* 1 are",
+        ),
     ],
 )
 def test_references_that_fit_no_completion_are_refused(changes, message):

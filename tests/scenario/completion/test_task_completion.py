@@ -43,7 +43,6 @@ def completed(
     some(
         [
             (PLANE, "tool.y: 0.1, tool.z: 0.5", "!Approach {}", (0.7 - BEFORE, 0.1, 0.5)),
-            (PLANE, "'tool.y, tool.z': 0.5", "!Approach {}", (0.7 - BEFORE, 0.5, 0.5)),
             (SPHERE, "tool.x: 0.5, tool.y: 0", "!Approach {}", (0.5, 0.0, 0.45 + BEFORE)),
             (PLANE, "tool.y: 0.1, tool.z: 0.5", "!Press {force: 5, name: first}", (0.7, 0.1, 0.5)),
         ]

@@ -170,22 +170,3 @@ def test_effort_limits_are_those_of_the_scenario_or_of_the_file(
     plant, _ = read_robot(Robot(str(tmp_path / "robot.urdf"), actuators=actuators))
     finalize(plant)
     assert plant.GetEffortUpperLimits() == [wanted]
-
-
-FRICTION = """
-robot: {file: arm.urdf, base: {weld: base}, actuators: all, leave_out: [dynamics/friction]}
-outputs: [!JointPositions {joints: [j]}]
-references: {j: 0}
-"""
-
-
-def test_a_joint_that_follows_with_multiplier_0_stands(tmp_path):
-    follow = '<mimic joint="j" multiplier="0" offset="0.3"/>'
-    joints = [joint("j", "base", "arm", "0 1 0"), joint("k", "arm", "hand", "0 1 0", rest=follow)]
-    bodies = [link(name, 1) for name in ("base", "arm", "hand")]
-    (tmp_path / "arm.urdf").write_text(robot("arm", *bodies, *joints))
-    (tmp_path / "arm.yaml").write_text(FRICTION)
-    links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
-    assert [signal.name for signal in links.position_signals] == ["j"]
-    weld = links.plant.GetJointByName("k").X_FM()
-    np.testing.assert_allclose(RollPitchYaw(weld.rotation()).vector(), [0, 0.3, 0], atol=1e-15)

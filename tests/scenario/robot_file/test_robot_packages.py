@@ -21,7 +21,6 @@ outputs:
 references: {panda_joint1: 0.2, panda_joint2: 0.3, panda_joint3: 0.4, panda_joint4: -0.5,
   panda_joint5: 0.6, panda_joint6: 0.7, panda_joint7: 0.8}
 """
-PACKAGE = "<package><name>{}</name></package>"
 
 pytestmark = [
     # Its collision meshes are left out.
@@ -71,20 +70,6 @@ def test_a_package_in_ros_package_path_is_found(tmp_path: Path, monkeypatch):
     monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path}/none:{tmp_path}/workspace")
     with pytest.warns(RobotFileWarning, match=f"{tmp_path}/none"):  # It is no folder.
         assert joints(tmp_path, file) == 7
-
-
-def test_directives_name_packages_by_files_in_packages(tmp_path: Path, monkeypatch):
-    write_panda(tmp_path)
-    cell = tmp_path / "cell"
-    (cell / "models").mkdir(parents=True)
-    (cell / "package.xml").write_text(PACKAGE.format("cell"))
-    (cell / "models" / "all.dmd.yaml").write_text(
-        "directives: [{add_directives: {file: package://cell/models/one.dmd.yaml}}]"
-    )
-    (cell / "models" / "one.dmd.yaml").write_text(
-        "directives: [{add_model: {name: arm, file: package://panda_description/urdf/panda.urdf}}]"
-    )
-    assert joints(tmp_path, "cell/models/all.dmd.yaml") == 7
 
 
 def test_geometry_of_an_unknown_package_is_left_out_with_the_key(tmp_path: Path):

@@ -70,14 +70,6 @@ def test_an_mjcf_body_of_mass_0_weighs_nothing_and_neither_does_its_geometry(bas
     np.testing.assert_allclose(mass_matrix(plant), mass_matrix(other), rtol=1e-10, atol=1e-12)
 
 
-def test_a_joint_that_moves_no_mass_is_named(tmp_path):
-    joints = [joint("j1", "base", "upper", "0 1 0"), joint("j2", "upper", "lower", "0 1 0")]
-    text = robot("arm", link("base", 1), link("upper", 1), '<link name="lower"/>', *joints)
-    own = Robot(str(written(tmp_path, text)), base=RobotPlacement("base"), actuators="all")
-    with pytest.raises(ScenarioError, match=r"robot\.file: .*j2\b.*lower"):
-        robot_links(own, SceneGraph())
-
-
 # Limits.
 
 NONE = (-np.inf, np.inf)
@@ -113,20 +105,31 @@ def test_limits_without_room_go_where_a_joint_or_the_scenario_says_so(
 ONE = (
     '<transmission type="SimpleTransmission"><joint name="{}"/><actuator name="m"/></transmission>'
 )
-WORDS = [
+PARTS = '<actuator name="m"/>', "<actuator name='m'>{}</actuator>".format
+GEAR = "<drake:gear_ratio xmlns:drake='d' value='0'/>"
+FAULTS = [
     ("r.urdf", 'mass value="1"', 'mass value="${m}"', r"r\.urdf:\d+: link 'a'.*\{m\}"),
     ("r.urdf", 'mass value="1"', 'mass value="1,5"', r"r\.urdf:\d+: link 'a'.*1,5"),
+    ("r.urdf", 'mass value="1"', 'mass value="0"', "'a'"),
+    ("r.urdf", 'mass value="1"', 'mass value="-4.0"', r"r\.urdf:3: link 'a'"),
+    ("r.urdf", 'parent link="a"', 'parent link="none"', r"r\.urdf"),
+    ("r.urdf", 'xyz="0 0 1"', 'xyz="0 -1"', "3 values .* 0 -1"),
+    ("r.urdf", 'xyz="0.01 -0.02 0.12"', 'xyz="nan 0 0"', "3 values .* nan"),
+    ("r.urdf", '"revolute"', '"planar"', "'j'"),
+    ("r.urdf", PARTS[0], PARTS[1](GEAR), "'m'.*0"),
+    ("r.urdf", "</robot>", "", r"r\.urdf"),
     ("r.xml", 'angle="radian"', 'coordinate="global"', r"r\.xml.*global"),
 ]
 
 
-@pytest.mark.parametrize(("name", "old", "new", "message"), WORDS)
-def test_words_that_are_no_numbers_and_global_coordinates_are_refused(
-    name, old, new, message, tmp_path
-):
-    text = robot("r", link("a", 1)) if name == "r.urdf" else MJCF.format(base="", mark="")
-    with pytest.raises(ModelError, match=message):
-        plant_of(written(tmp_path, text.replace(old, new), name))
+@pytest.mark.parametrize(("name", "old", "new", "message"), FAULTS)
+def test_faults_that_drake_would_change_or_pass_over_are_refused(name, old, new, message, tmp_path):
+    parts = link("a", 1), link("b", 1), joint("j", "a", "b", "0 0 1"), ONE.format("j")
+    text = robot("r", *parts) if name == "r.urdf" else MJCF.format(base="", mark="")
+    assert old in text
+    file = written(tmp_path, text.replace(old, new, 1), name)
+    with pytest.raises((ModelError, ScenarioError), match=message):
+        robot_links(Robot(str(file), base=RobotPlacement("a")), SceneGraph())
 
 
 def test_motors_of_one_name_are_two_and_one_without_effort_is_lost(tmp_path):

@@ -24,17 +24,11 @@ SOFT = "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5, friction: 0
 
 @dataclass(frozen=True)
 class Case:
-    """A run.
+    """A run: a shipped scenario, what is changed in it, its fixed step and its duration, in s.
 
-    Attributes:
-        scenario: The shipped scenario.
-        settings: What is changed in it.
-        step: The fixed step, in s.
-        duration: In s.
-        contact: Whether Drake's contact solver makes its steps.
-        amplifies: Whether the run amplifies round-off: a contact that opens and closes.
-        rolls: Whether a rollout makes the same run.
-        is_slow: Whether `make check` leaves it out.
+    `contact`: Drake's contact solver makes its steps. `amplifies`: it amplifies round-off, since a
+    contact opens and closes. `rolls`: a rollout makes the same run. `is_slow`: `make check` leaves
+    it out.
     """
 
     scenario: str
@@ -59,33 +53,12 @@ class Case:
 
 
 IDEAL = (
-    "boom",
-    "cart_wall",
-    "conveyor",
-    "crank_turning",
-    "five_bar",
-    "four_bar",
-    "planar_3rrr",
-    "planar_4rrr",
-    "seven_joint_dome",
-    "seven_joint_flexible",
-    "seven_joint_flexible_motors",
-    "seven_joint_moving_plate",
-    "seven_joint_pipe",
-    "seven_joint_wall",
-    "slider_crank",
-    "slider_crank_flexible",
-    "stewart_platform",
-    "three_fingers",
-    "biped",
-    "two_arms",
-    "two_arms_free_box",
-    "two_link_wall",
-    "two_link_flexible",
-    "two_link_flexible_motors",
-    "two_link_hydraulics",
-    "two_link_measured_force",
-    "two_link_motors",
+    *("boom", "cart_wall", "conveyor", "crank_turning", "five_bar", "four_bar", "planar_3rrr"),
+    *("planar_4rrr", "seven_joint_dome", "seven_joint_flexible", "seven_joint_flexible_motors"),
+    *("seven_joint_moving_plate", "seven_joint_pipe", "seven_joint_wall", "slider_crank"),
+    *("slider_crank_flexible", "stewart_platform", "three_fingers", "biped", "two_arms"),
+    *("two_arms_free_box", "two_link_wall", "two_link_flexible", "two_link_flexible_motors"),
+    *("two_link_hydraulics", "two_link_measured_force", "two_link_motors"),
 )
 
 QUICK = {"two_link_wall", "seven_joint_wall", "slider_crank", "two_link_flexible_motors"}

@@ -12,7 +12,6 @@ from problems.hidden import Hidden, hidden_normal_form
 from problems.made_up import (
     bead,
     changed,
-    circuit,
     double_integrator,
     early_control,
     held_point,
@@ -33,7 +32,7 @@ from problems.mechanisms import (
     pendulum_tension,
     two_link_arm,
 )
-from problems.nonholonomic import knife_edge, knife_edge_force, rolling_disk
+from problems.nonholonomic import knife_edge, knife_edge_force
 from problems.problem import Array, Known, Problem, known, unconstrained
 
 __all__ = [
@@ -71,13 +70,11 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
         pendulum,
         pendulum_tension,
         two_link_arm,
-        circuit,
         linear,
         third_order,
         mixed_degrees,
         knife_edge,
         knife_edge_force,
-        rolling_disk,
         aircraft,
         gantry,
         held_point,

@@ -1,4 +1,4 @@
-"""A circuit, systems made up for what no machine at hand shows, and systems in other units."""
+"""Systems made up for what no machine at hand shows, and systems in other units."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae import DaeSystem, Signal, with_disturbance
+from drake_dae.dae import DaeSystem, with_disturbance
 from problems.problem import Array, Known, Problem, known
 
 
@@ -67,57 +67,6 @@ def linear() -> Problem:
         derivatives=lambda state: k @ state,
         horizon=0.5,  # One of its zeros is -134 1/s: SciPy takes small steps.
         source="Krishnan and McClamroch 1992; by matrices: Dai, Singular Control Systems, 1989",
-    )
-
-
-def circuit() -> Problem:
-    """Two coils in series behind a source u, then a capacitor: an inductor cutset, index 2.
-
-    The node between the coils carries no current away, k = i1 - i2, and its voltage is v:
-    L1 i1' = u - R1 i1 - v, L2 i2' = v - R2 i2 - e, C e' = i2. With z = e, e'' = i2'/C and
-    i2' = (u - R1 i1 - R2 i2 - e)/(L1 + L2) on N*: r = 1, mu = 2.
-    """
-    l1, l2, r1, r2, c = 0.2, 0.3, 1.5, 2.0, 0.05
-    system = DaeSystem.from_functions(
-        [Signal("i1", "A"), Signal("i2", "A"), Signal("e", "V")],
-        f=lambda x, p: [-p.r1 * x[0] / p.l1, (-p.r2 * x[1] - x[2]) / p.l2, x[1] / p.c],
-        g=lambda x, p: [-1.0 / p.l1, 1.0 / p.l2, 0.0],
-        h=lambda x, p: [1.0 / p.l1, 0.0, 0.0],
-        k=lambda x, p: x[0] - x[1],
-        l=lambda x, p: x[2],
-        m=lambda x, p: 0.0,
-        parameters={"l1": l1, "l2": l2, "r1": r1, "r2": r2, "c": c},
-        name="circuit",
-    )
-
-    def closed_form(x: Array) -> Known:
-        conductance = 1.0 / l1 + 1.0 / l2
-        difference = -r1 * x[0] / l1 - (-r2 * x[1] - x[2]) / l2
-        alpha = difference / conductance
-        return known(
-            -conductance,
-            alpha,
-            l2 / (l1 + l2),
-            (alpha - r2 * x[1] - x[2]) / (l2 * c),
-            1.0 / ((l1 + l2) * c),
-        )
-
-    def consistent(random: np.random.Generator) -> Array:
-        current, voltage = random.standard_normal(2)
-        return np.array([current, current, voltage])
-
-    return Problem(
-        system=system,
-        constraint_degrees=(1,),
-        output_degrees=(2,),
-        index=2,
-        zero_dynamics=0,
-        output_order=(0,),
-        known=closed_form,
-        consistent=consistent,
-        reference=[(0.0, 0.0, 1.0)],
-        derivatives=lambda x: np.array([x[0] - x[1]]),
-        source="Tischendorf, Surveys on Mathematics for Industry 8, 1999: L-I cutsets",
     )
 
 

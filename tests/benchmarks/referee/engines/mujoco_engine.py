@@ -3,26 +3,20 @@
 import mujoco
 import numpy as np
 
-from referee.description import Body, Closure, Mechanism
+from referee.description import Closure, Mechanism
 
 NAME = "MuJoCo"
 NOTE = (
     "soft constraints: regularized acceleration, impedance at its largest value of 0.9999, "
-    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in 10,000 steps, with a "
-    "time constant of two steps, the least"
+    "Newton's solver to 1e-15, elliptic cones"
 )
 HARD = 'solimp="0.9999 0.9999 0.001 0.5 2" solref="-1e-9 -1e-9"'
 """At a consistent state the reference acceleration is zero, so no stiffness is needed."""
-
-STEPS = 10_000
-"""The steps of a motion."""
 
 # Of the top at q = 0, where its first and last axes are one: MuJoCo writes it into a file.
 mujoco.set_mju_user_warning(lambda message: None)
 
 RADIUS = 0.01
-GRIP = 10.0
-"""The friction of a ball that must not slip."""
 
 SLIDING = 'solreffriction="-1e-9 -15"'
 """Friction that reaches its cone; more would make the normal force larger."""
@@ -33,25 +27,8 @@ def numbers(values: object) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def body_xml(mechanism: Mechanism, body: Body, geoms: dict[str, list[str]]) -> str:
-    """A body with its joints, sites and children."""
-    first = mechanism.first_joint(body.name)
-    kinds = {"turn": "hinge", "slide": "slide"}
-    lines = [f'<body name="{body.name}" pos="{numbers(body.at)}">']
-    lines += [
-        f'<joint name="j{first + k}" type="{kinds[kind]}" axis="{numbers(axis)}"/>'
-        for k, (kind, axis) in enumerate(body.joints)
-    ]
-    lines.append(
-        f'<inertial pos="{numbers(body.center)}" mass="{body.mass!r}" '
-        f'diaginertia="{numbers(body.inertia)}"/>'
-    )
-    lines += inside(mechanism, body.name, geoms)
-    return "".join([*lines, "</body>"])
-
-
-def inside(mechanism: Mechanism, name: str, geoms: dict[str, list[str]]) -> list[str]:
-    """Sites, geometry and children of a body."""
+def inside(mechanism: Mechanism, name: str, geoms: dict[str, list[str]]) -> str:
+    """Sites, geometry and children of a body, in MJCF."""
     lines = list(geoms.get(name, []))
     ends = [(c.name, c.body_a, c.point_a, c.body_b, c.point_b) for c in mechanism.closures]
     ends += [
@@ -62,8 +39,19 @@ def inside(mechanism: Mechanism, name: str, geoms: dict[str, list[str]]) -> list
         for suffix, body, point in (("a", body_a, point_a), ("b", body_b, point_b)):
             if body == name:
                 lines.append(f'<site name="{own}_{suffix}" pos="{numbers(point)}"/>')
-    children = [body for body in mechanism.bodies if body.parent == name]
-    return lines + [body_xml(mechanism, child, geoms) for child in children]
+    for body in mechanism.bodies:
+        if body.parent != name:
+            continue
+        lines.append(f'<body name="{body.name}" pos="{numbers(body.at)}">')
+        for number, (kind, axis) in enumerate(body.joints, mechanism.first_joint(body.name)):
+            kind = {"turn": "hinge", "slide": "slide"}[kind]
+            lines.append(f'<joint name="j{number}" type="{kind}" axis="{numbers(axis)}"/>')
+        lines.append(
+            f'<inertial pos="{numbers(body.center)}" mass="{body.mass!r}" '
+            f'diaginertia="{numbers(body.inertia)}"/>'
+        )
+        lines += [inside(mechanism, body.name, geoms), "</body>"]
+    return "".join(lines)
 
 
 def equality(mechanism: Mechanism, closure: Closure) -> str:
@@ -73,8 +61,6 @@ def equality(mechanism: Mechanism, closure: Closure) -> str:
         return f'<connect name="{name}" {sites} {HARD}/>'
     if closure.kind == "weld":
         return f'<weld name="{name}" {sites} {HARD}/>'
-    if closure.kind == "distance":
-        return f'<tendon name="{name}" tendon1="{name}" {HARD}/>'
     if closure.kind == "gear":
         leader, follower = (
             mechanism.first_joint(body) for body in (closure.body_a, closure.body_b)
@@ -87,11 +73,6 @@ def equality(mechanism: Mechanism, closure: Closure) -> str:
 def xml(mechanism: Mechanism, geoms: dict[str, list[str]]) -> str:
     """The mechanism in MJCF."""
     tendons = [
-        f'<spatial name="{c.name}"><site site="{c.name}_a"/><site site="{c.name}_b"/></spatial>'
-        for c in mechanism.closures
-        if c.kind == "distance"
-    ]
-    tendons += [
         f'<spatial name="spring{i}" stiffness="{s.stiffness!r}" springlength="{s.length!r}">'
         f'<site site="spring{i}_a"/><site site="spring{i}_b"/></spatial>'
         for i, s in enumerate(mechanism.springs)
@@ -100,7 +81,7 @@ def xml(mechanism: Mechanism, geoms: dict[str, list[str]]) -> str:
         <option gravity="{numbers(mechanism.gravity)}" solver="Newton" cone="elliptic"
           tolerance="1e-15" iterations="1000" ls_iterations="1000" ls_tolerance="1e-12"
           jacobian="dense"/>
-        <worldbody>{"".join(inside(mechanism, "world", geoms))}</worldbody>
+        <worldbody>{inside(mechanism, "world", geoms)}</worldbody>
         <tendon>{"".join(tendons)}</tendon>
         <equality>{"".join(equality(mechanism, c) for c in mechanism.closures)}</equality>
         <contact>{"".join(geoms.get("pairs", []))}</contact>
@@ -108,38 +89,22 @@ def xml(mechanism: Mechanism, geoms: dict[str, list[str]]) -> str:
 
 
 def solved(
-    mechanism: Mechanism,
-    q: np.ndarray,
-    v: np.ndarray,
-    geoms: dict[str, list[str]],
-    duration: float = 0.0,
+    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, geoms: dict[str, list[str]]
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The model, and its data after the forward dynamics at a state, or a while later."""
-    text = xml(mechanism, geoms)
-    step = duration / STEPS
-    if duration:
-        text = text.replace('solref="-1e-9 -1e-9"', f'solref="{2 * step} 1"')
-    model = mujoco.MjModel.from_xml_string(text)
-    if duration:
-        model.opt.timestep, model.opt.integrator = step, mujoco.mjtIntegrator.mjINT_RK4
+    """The model, and its data after the forward dynamics at a state."""
+    model = mujoco.MjModel.from_xml_string(xml(mechanism, geoms))
     data = mujoco.MjData(model)
     for i in range(mechanism.size):
         joint = model.joint(f"j{i}")
         data.qpos[joint.qposadr[0]], data.qvel[joint.dofadr[0]] = q[i], v[i]
         data.qfrc_applied[joint.dofadr[0]] = mechanism.torques.get(i, 0.0)
-    for closure in mechanism.closures:
-        if closure.kind == "distance":
-            length = model.tendon_length0[model.tendon(closure.name).id]
-            model.eq_data[model.equality(closure.name).id, 0] = closure.size - length
-    for _ in range(STEPS if duration else 0):
-        mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     return model, data
 
 
 def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, list[str]]:
     """A plane for each contact, and a ball on the body that touches it at the point."""
-    touching = [c for c in mechanism.closures if c.kind in ("plane", "ball")]
+    touching = [c for c in mechanism.closures if c.kind == "plane"]
     geoms: dict[str, list[str]] = {}
     if not touching:
         return geoms
@@ -147,10 +112,7 @@ def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[st
     for closure in touching:
         normal = np.array(closure.direction)
         rotation = data.xmat[model.body(closure.body_b).id].reshape(3, 3)
-        ball = closure.kind == "ball"
-        radius = closure.size if ball else RADIUS
-        center = np.array(closure.point_b) + (0 if ball else RADIUS * rotation.T @ normal)
-        friction = GRIP if ball else closure.friction
+        center, friction = closure.point_b + RADIUS * rotation.T @ normal, closure.friction
         plane, sphere = (f'name="{closure.name}_{end}" contype="0" conaffinity="0"'
                          for end in ("plane", "ball"))  # fmt: skip
         geoms.setdefault("world", []).append(
@@ -158,7 +120,7 @@ def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[st
             f'zaxis="{numbers(normal)}"/>'
         )
         geoms.setdefault(closure.body_b, []).append(
-            f'<geom {sphere} type="sphere" size="{radius}" pos="{numbers(center)}" mass="0"/>'
+            f'<geom {sphere} type="sphere" size="{RADIUS}" pos="{numbers(center)}" mass="0"/>'
         )
         geoms.setdefault("pairs", []).append(
             f'<pair geom1="{closure.name}_plane" geom2="{closure.name}_ball" margin="0.001" '
@@ -177,25 +139,16 @@ def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarra
     return full[np.ix_(order, order)]
 
 
-def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The forces after the motion from there."""
-    if any(closure.kind == "plane" for closure in mechanism.closures):
-        raise NotImplementedError("a ball stands for the point that touches: other motion")
-    return forces(mechanism, q, v, mechanism.duration)
-
-
-def forces(
-    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float = 0.0
-) -> dict[str, np.ndarray]:
-    """The force of each closure in the components of `force_names`, after a while."""
+def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`."""
     if any(any(closure.road) for closure in mechanism.closures):
         raise NotImplementedError("no constraint that moves with time")
     if any(closure.kind == "hinge" for closure in mechanism.closures):
         raise NotImplementedError("no hinge among the equality constraints")
-    model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v), duration)
+    model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v))
     found = {}
     for closure in mechanism.closures:
-        if closure.kind in ("plane", "ball"):
+        if closure.kind == "plane":
             found[closure.name] = contact_force(model, data, closure)
             continue
         number = model.equality(closure.name).id
@@ -224,10 +177,7 @@ def moment(
 
 def contact_force(model: mujoco.MjModel, data: mujoco.MjData, closure: Closure) -> np.ndarray:
     """The force of a contact on the body, in the world."""
-    if closure.kind == "ball":
-        target = data.site(f"{closure.name}_b").xpos - closure.size * np.array(closure.direction)
-    else:
-        target = data.site(f"{closure.name}_b").xpos
+    target = data.site(f"{closure.name}_b").xpos
     if not data.ncon:
         raise NotImplementedError("the contact opened")
     near = min(range(data.ncon), key=lambda i: np.linalg.norm(data.contact[i].pos - target))

@@ -18,7 +18,6 @@ REFUSED = {
     "gear": "no gear among its constraints",
     "plane": "its points are fixed in all directions; contacts that slide are solved for rates, "
     "after a step of time",
-    "ball": "no rolling among its constraints",
 }
 
 
@@ -45,18 +44,8 @@ def order(mechanism: Mechanism, model: pin.Model) -> list[int]:
     return [model.idx_vs[model.getJointId(f"j{i}")] for i in range(mechanism.size)]
 
 
-def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """M in the order of the description."""
-    model, _ = model_of(mechanism)
-    places = order(mechanism, model)
-    own = np.zeros(model.nq)
-    own[places] = q
-    matrix = pin.crba(model, model.createData(), own)
-    return (np.triu(matrix) + np.triu(matrix, 1).T)[np.ix_(places, places)]
-
-
-def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The force of each closure in the components of `force_names`."""
+def solver(mechanism: Mechanism, q: np.ndarray, v: np.ndarray, proximal: tuple = PROXIMAL) -> tuple:
+    """`constraintDynamics` at a state, without arguments, and the constraints that it finds."""
     for closure in mechanism.closures:
         if closure.kind in REFUSED:
             raise NotImplementedError(REFUSED[closure.kind])
@@ -83,8 +72,14 @@ def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.n
     known = pin.StdVec_RigidConstraintData()
     known.extend(closure.createData() for closure in closures)
     pin.initConstraintDynamics(model, data, closures, known)
-    settings = pin.ProximalSettings(*PROXIMAL)
-    pin.constraintDynamics(model, data, own, rate, torque, closures, known, settings)
+    settings, solve = pin.ProximalSettings(*proximal), pin.constraintDynamics
+    return lambda: solve(model, data, own, rate, torque, closures, known, settings), known, places
+
+
+def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`."""
+    solve, known, _ = solver(mechanism, q, v)
+    solve()
     found = {}
     for closure, result in zip(mechanism.closures, known, strict=True):
         rotation, force = result.oMc1.rotation, result.contact_force
