@@ -3,7 +3,7 @@
 CasADi's own messages do not say which function of (1)-(3) is wrong, or how to correct it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,34 +19,34 @@ from drake_dae.trace.compiled import check_choice
 from drake_dae.trace.expressions import find_flaw
 
 
-def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
+def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
     """Checks the fields of a system and returns those that change, converted."""
-    name, state = arguments["name"], arguments["state"]
+    name, state = given["name"], given["state"]
     if not (is_symbol(state) and state.numel()):
         raise ModelError(
             f"{name}: 'state' must be a CasADi SX column of symbols, "
             f"for example casadi.SX.sym('x', 4); got {type(state).__name__}"
         )
     state = ca.vec(state)
-    check_choice(name, arguments["compiled"])
-    if not 1e-15 <= number(f"{name}: least_margin", arguments["least_margin"]) < 1.0:
+    check_choice(name, given["compiled"])
+    if not 1e-15 <= number(f"{name}: least_margin", given["least_margin"]) < 1.0:
         raise ModelError(
             f"{name}: least_margin must be from 1e-15, which is round-off, to below 1, got "
-            f"{brief(arguments['least_margin'])}"
+            f"{brief(given['least_margin'])}"
         )
     for key, kind in (("contacts", UnilateralInput), ("parameters", Parameter)):
-        items = arguments[key]
+        items = given[key]
         if not isinstance(items, (list, tuple)) or not all(isinstance(i, kind) for i in items):
             raise ModelError(
                 f"{name}: {key} must be a list of {kind.__name__}s, got {brief(items)}"
             )
-    parameters = tuple(arguments["parameters"])
+    parameters = tuple(given["parameters"])
     known = [p.name for p in parameters]
     _check_unique(name, "parameter", known)
-    for contact in arguments["contacts"]:
+    for contact in given["contacts"]:
         if contact.friction not in (None, *known):
             raise ModelError(f"{name}: {unknown_name('parameter', contact.friction, known)}")
-    expressions = _expressions(name, arguments, state, parameter_symbol(parameters))
+    expressions = _expressions(name, given, state, parameter_symbol(parameters))
     fields = {"state": state, "parameters": parameters, **expressions}
     n, m = state.numel(), expressions["k"].numel()
     p, q = expressions["h"].shape[1], expressions["l"].numel()
@@ -57,32 +57,29 @@ def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
         ("control_signals", p, "u"),
         ("output_signals", q, "z"),
     ):
-        named = arguments[key] or [f"{letter}{i}" for i in range(count)]
+        named = given[key] or [f"{letter}{i}" for i in range(count)]
         fields[key] = signals = _as_signals(f"{name}: {key}", named)
         if len(signals) != count:
             raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
         _check_unique(name, key, [signal.name for signal in signals])
-    for key in ("nominal_state", "state_scale"):
-        value = np.zeros(n) if key == "nominal_state" and arguments[key] is None else arguments[key]
+    for key, default in (("nominal_state", np.zeros(n)), ("state_scale", None)):
+        value = default if given[key] is None else given[key]
         if value is not None:
             fields[key] = vector(f"{name}: {key}", value, n)
             fields[key].setflags(write=False)
     if np.any(fields.get("state_scale", 1.0) <= 0.0):
+        raise ModelError(f"{name}: state_scale must be positive, got {brief(given['state_scale'])}")
+    if "control_metric" not in expressions and "free_control" in expressions:
         raise ModelError(
-            f"{name}: state_scale must be positive, got {brief(arguments['state_scale'])}"
+            f"{name}: free_control needs a control_metric, which measures the distance from it"
         )
-    if "control_metric" not in expressions:
-        if "free_control" in expressions:
+    if "control_metric" in expressions:
+        if p <= q:
             raise ModelError(
-                f"{name}: free_control needs a control_metric, which measures the distance from it"
+                f"{name}: control_metric chooses among controls, but with {p} controls and {q} "
+                "controlled outputs there is nothing to choose; leave it out"
             )
-        return fields
-    if p <= q:
-        raise ModelError(
-            f"{name}: control_metric chooses among controls, but with {p} controls and {q} "
-            "controlled outputs there is nothing to choose; leave it out"
-        )
-    fields.setdefault("free_control", ca.SX(p, 1))
+        fields.setdefault("free_control", ca.SX(p, 1))
     return fields
 
 
@@ -110,7 +107,24 @@ def fields_of_functions(
     arguments: list[Any] = [x]
     if defined:
         arguments.append(SimpleNamespace(**{p.name: p.symbol for p in defined}))
-    values = {key: _called(owner, key, function, arguments) for key, function in functions.items()}
+    values = dict[str, ca.SX]()
+    for letter, function in functions.items():
+        if function is not None and not callable(function):
+            raise ModelError(
+                f"{owner}: {letter} must be a function of the state, got {brief(function)}; "
+                "`DaeSystem(...)` takes expressions"
+            )
+        try:
+            value = ca.SX(0, 0) if function is None else function(*arguments)
+        except Exception as error:
+            taken = "the state x and the parameters p" if defined else "the state x alone"
+            raise ModelError(
+                f"{owner}: function {letter} failed on a CasADi column of {x.numel()} states: "
+                f"{error}. It is called with {taken}; use CasADi's own functions (casadi.sin) or "
+                "plain operators. A condition, as in if, max or min, is not smooth: write the "
+                "branch in which the state remains"
+            ) from error
+        values[letter] = as_expression(owner, letter, value)
     if values["h"].shape[0] == 1 and x.numel() != 1:
         values["h"] = values["h"].T
     return {"state": x, **values, "parameters": defined, "state_signals": named, **labels}
@@ -118,8 +132,6 @@ def fields_of_functions(
 
 def as_expression(owner: str, key: str, value: Any) -> ca.SX:
     """Converts an SX, a number, an array, or a (nested) list of these to an SX matrix."""
-    if isinstance(value, ca.MX):
-        raise ModelError(f"{owner}: {key} is a CasADi MX; use SX symbols and expressions")
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
     try:
@@ -135,14 +147,13 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 
 
 def _expressions(
-    owner: str, arguments: Mapping[str, Any], state: ca.SX, parameters: ca.SX
+    owner: str, given: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
     """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them."""
-    optional = ("mass_matrix", "control_metric", "free_control")
-    functions = {key: arguments[key] for key in "fghklm"} | {
-        "mass_matrix": ca.SX.eye(state.numel())
-    }
-    functions |= {key: arguments[key] for key in optional if arguments[key] is not None}
+    functions = {key: given[key] for key in "fghklm"} | {"mass_matrix": ca.SX.eye(state.numel())}
+    for key in ("mass_matrix", "control_metric", "free_control"):
+        if given[key] is not None:
+            functions[key] = given[key]
     values = {key: as_expression(owner, key, value) for key, value in functions.items()}
     n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
     q = values["l"].numel()
@@ -158,10 +169,9 @@ def _expressions(
         if value.shape != shape and value.shape == shape[::-1] and 1 in shape:
             value = value.T
         if value.shape != shape:
-            missing = " (k is given, so g and m are needed)" if value.numel() == 0 else ""
             raise ModelError(
                 f"{owner}: {key} has shape {value.shape}, expected {shape} for n = {n} states, "
-                f"m = {m} constraints, p = {p} controls, {q} controlled outputs{missing}"
+                f"m = {m} constraints, p = {p} controls, {q} controlled outputs"
             )
         unknown = [s.name() for s in ca.symvar(value) if not ca.depends_on(allowed, s)]
         if unknown:
@@ -188,34 +198,7 @@ def _check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
 
 def _as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
     """Converts a list of signals, or of names of signals without unit, to signals."""
-    items = [signals] if isinstance(signals, str) or not isinstance(signals, Sequence) else signals
-    bad = [item for item in items if not isinstance(item, (Signal, str))]
-    if items is not signals or bad:
-        raise ModelError(f"{what} must be a list of names or Signals, got {(bad or items)[0]!r}")
-    return tuple(Signal(item) if isinstance(item, str) else item for item in items)
-
-
-def _called(
-    owner: str, letter: str, function: Callable[..., Any] | None, arguments: list[Any]
-) -> ca.SX:
-    """Calls a user's function with symbols and returns its expression; empty without a function."""
-    if function is None:
-        return ca.SX(0, 0)
-    if not callable(function):
-        raise ModelError(
-            f"{owner}: {letter} must be a function of the state, got "
-            f"{type(function).__name__}; `DaeSystem(...)` takes expressions"
-        )
-    try:
-        value = function(*arguments)
-    except Exception as error:
-        taken = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
-        raise ModelError(
-            f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
-            f"states: {error}. It is called with {taken}; use CasADi's own functions (casadi.sin) "
-            "or plain operators. A condition, as in if, max or min, is not smooth: write the "
-            "branch in which the state remains"
-        ) from error
-    if value is None:
-        raise ModelError(f"{owner}: function {letter} returned nothing")
-    return as_expression(owner, letter, value)
+    is_list = isinstance(signals, Sequence) and not isinstance(signals, str)
+    if not is_list or not all(isinstance(item, (Signal, str)) for item in signals):
+        raise ModelError(f"{what} must be a list of names or Signals, got {brief(signals)}")
+    return tuple(Signal(item) if isinstance(item, str) else item for item in signals)

@@ -6,7 +6,7 @@ from math import isfinite
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
+import scipy  # SciPy loads its large parts when they are used.
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
@@ -17,17 +17,16 @@ from drake_dae.trace.factorization import PositiveDefiniteFactorization, nonzero
 from drake_dae.trace.functions import TracedFunction, count_operations
 from drake_dae.trace.numerics import (
     PRECISION,
-    ROUND_OFF,
     ROUNDING,
     NewtonModel,
     are_dependent,
+    equilibration,
     newton,
     norm,
     polished,
-    positive,
+    rank_of,
     row_lengths,
     shortest_steps,
-    steps_along,
     unit_rows,
 )
 
@@ -40,13 +39,9 @@ FAR = 100.0
 # A state counts as consistent, and is projected without a message, if its distance from N*
 # relative to its size is at most this; where gradients are dependent, if its residual is.
 CONSISTENT = 1e-8
-# Constraint forces do no work if they are along the gradients to this, as the sine of an angle.
-ALONG = 1e-6
-
-
-# Rows of the residual, the states that are new in them, and how many rates lead from velocities to
-# these states; None if their steps do not take the least kinetic energy.
-Level = tuple[Indices, Indices, int | None]
+# Rows of the residual, the states that are new in them, and how many further derivatives of these
+# rows there are until the constraint inputs act.
+Level = tuple[Indices, Indices, int]
 FLOOR = 1e-12  # A distance from N* that is round-off even if all states are zero.
 
 
@@ -201,26 +196,20 @@ class Manifold:
         return found
 
     def _downhill(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """The end of damped least-squares steps, each of which decreases the residual."""
-        z, damping, scale = start / self.scale, 1.0, self.scale
-        gradients = self.gradients(start, p) * scale
-        length = row_lengths(gradients)
-        residual = self.residual(start, p) / length
-        for _ in range(SEARCH):
-            size = norm(residual)
-            if not (np.isfinite(gradients).all() and 0.0 < size < np.inf):
-                break
-            u, s, v = np.linalg.svd(gradients / length[:, None], full_matrices=False)
-            step = (u.T @ residual) * s / positive(s * s + damping * size) @ v
-            following = self.residual(scale * (z - step), p) / length
-            if norm(following) < size:
-                z, residual, damping = z - step, following, 1.0
-                gradients = self.gradients(scale * z, p) * scale
-            elif size <= ROUND_OFF * (1.0 + norm(z)):
-                break
-            else:
-                damping *= 4.0
-        return np.asarray(scale * z)
+        """The end of least-squares steps, each of which decreases the residual."""
+        length = row_lengths(self.gradients(start, p) * self.scale)
+        if not (np.isfinite(length).all() and np.isfinite(self.residual(start, p)).all()):
+            return start
+        found = scipy.optimize.least_squares(
+            lambda z: self.residual(self.scale * z, p) / length,
+            start / self.scale,
+            lambda z: self.gradients(self.scale * z, p) * self.scale / length[:, None],
+            xtol=PRECISION * 10.0,
+            ftol=None,
+            gtol=None,
+            max_nfev=SEARCH,
+        )
+        return np.asarray(self.scale * found.x)
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
@@ -255,13 +244,12 @@ class Manifold:
     ) -> FloatArray:
         """Returns the consistent state next to a user's start, level by level: positions first.
 
-        Newton's method is used on each order of derivatives, by the states that are new in it. A
-        mechanical system E x' = f + g v has constraint forces along the gradients of its
-        constraints. Their impulses change velocities by dv = M^-1 J^T mu, the change of least
-        kinetic energy. Positions change in the same way, dq = N M^-1 N^T J_q^T mu with q' = N v. So
-        heavy bodies move little in any units, and coordinates on which no constraint force acts do
-        not change. Where constraint forces do work, steps are shortest relative to the scale of the
-        states.
+        Newton's method is used on each order of derivatives, by the states that are new in it:
+        these change as impulses mu of the constraint inputs change them, dv = E^-1 g mu, and
+        dq = (dq'/dv) E^-1 g mu. In a mechanical system this is the change of least kinetic energy,
+        dv = M^-1 J^T mu, in which heavy bodies move little in any units, and coordinates on which
+        no constraint force acts do not change. Where states keep their values, or impulses do not
+        reach the constraint, steps are shortest relative to the scale of the states.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
         named = places_of("state", fixed, self.system.state_signals, f"{self.system.name}: ")
@@ -294,25 +282,13 @@ class Manifold:
         """The state next to a start where chosen states, and if possible velocities, stay."""
         # The states that are new in derivatives of constraints and not 0, where others are 0.
         moving = [new[start[new] != 0.0] for _, new, _ in self._levels[1:] if not start[new].all()]
-        wanted, ways = np.unique(np.concatenate([chosen, *moving])), [self._levels]
-        if self._does_no_work(start, p):
-            # The number of further derivatives of a row until the constraint inputs act.
-            degrees, orders = self.layout.degrees, self.layout.orders
-            further = np.repeat(degrees, degrees).astype(int) - 1 - orders
-            kinetic: list[Level] = [
-                (np.flatnonzero(further == depth), self._groups[depth], depth)
-                for depth in reversed(range(len(self._groups)))
-                if np.any(further == depth)
-            ]
-            ways = [kinetic, self._levels]
+        wanted = np.unique(np.concatenate([chosen, *moving]))
         for kept in (wanted, chosen) if wanted.size > chosen.size else (chosen,):
-            for levels in ways:
-                state = start.copy()
-                if all(self._met(state, p, kept, *level) for level in levels):
-                    far = norm((state - start) / self.scale)
-                    if kept is chosen or far <= FAR * norm(start / self.scale):
-                        return state
-                    break
+            state = start.copy()
+            if all(self._met(state, p, kept, level) for level in self._levels):
+                far = norm((state - start) / self.scale)
+                if kept is chosen or far <= FAR * norm(start / self.scale):
+                    return state
         return None
 
     def _state(self, state: ArrayLike) -> FloatArray:
@@ -325,28 +301,42 @@ class Manifold:
 
     @cached_property
     def _levels(self) -> list[Level]:
-        """The levels by the order of derivatives, with the states that are new in each."""
+        """The levels, the farthest from the constraint inputs first, as positions are."""
+        further = np.array(self.layout.degrees)[self.layout.owners] - 1 - self.layout.orders
         used, levels = nonzeros(self.gradient.sparsity()), list[Level]()
         taken = np.zeros(used.shape[1], dtype=bool)
-        for order in range(max(self.layout.degrees)):
-            rows = np.flatnonzero(self.layout.orders == order)
+        for depth in reversed(range(max(self.layout.degrees))):
+            rows = np.flatnonzero(further == depth)
             new = used[rows].any(axis=0) & ~taken
             taken |= new
-            levels.append((rows, np.flatnonzero(new), None))
+            levels.append((rows, np.flatnonzero(new), depth))
         return levels
 
-    def _met(
-        self,
-        state: FloatArray,
-        parameters: FloatArray,
-        kept: Indices,
-        rows: Indices,
-        new: Indices,
-        depth: int | None,
-    ) -> bool:
+    @cached_property
+    def _impulses(self) -> tuple[TracedFunction, list[list[int]]]:
+        """E^-1 g in the states that it moves, then the changes of states that follow from these."""
+        system, inertia = self.system, PositiveDefiniteFactorization(self.system.mass_matrix)
+        pushed, coupled = system.frictional_contacts.without_friction(system.g), system.mass_matrix
+        taken, outputs = np.zeros(system.num_states, dtype=bool), dict[str, ca.SX]()
+        groups = list[list[int]]()
+        for depth in range(max(self.layout.degrees)):
+            moved = nonzeros(pushed.sparsity()).any(axis=1)
+            for _ in range(system.num_states):
+                moved = moved | nonzeros(coupled.sparsity())[:, moved].any(axis=1)
+            group, rest = (np.flatnonzero(each & ~taken).tolist() for each in (moved, ~moved))
+            taken = taken | moved
+            changes = inertia.solve(pushed)[group, :]
+            outputs[f"change{depth}"] = ca.densify(changes)
+            groups.append(group)
+            pushed = ca.SX(*pushed.shape)
+            pushed[rest, :] = ca.mtimes(ca.jacobian(system.f[rest], system.state[group]), changes)
+        return system.trace("impulses", outputs, often=False), groups
+
+    def _met(self, state: FloatArray, p: FloatArray, kept: Indices, level: Level) -> bool:
         """Changes new states that are not kept so that some rows of the residual vanish."""
-        columns = np.setdiff1d(new, kept)
-        scale = self.scale[columns]
+        (rows, new, depth), (function, groups) = level, self._impulses
+        columns = np.setdiff1d(np.union1d(new, groups[depth]), kept)
+        scale, changes = self.scale[columns], np.zeros((state.size, self.system.num_constraints))
 
         def filled(z: FloatArray) -> FloatArray:
             x = state.copy()
@@ -354,81 +344,28 @@ class Manifold:
             return x
 
         def residual(z: FloatArray) -> FloatArray:
-            return self.residual(filled(z), parameters)[rows]
+            return self.residual(filled(z), p)[rows]
 
         def linearize(z: FloatArray) -> NewtonModel | None:
             x = filled(z)
-            gradients = self.gradients(x, parameters)[np.ix_(rows, columns)]
-            if depth is None or columns.size < new.size:
-                return shortest_steps(gradients * scale, residual)
-            # W^-1 C^T, where W is the metric of the states of this level.
-            mass, _, *rates = self._metric_at(x, parameters)
-            moved: FloatArray = gradients.T
-            for rate in reversed(rates[:depth]):
-                moved = rate.T @ moved
-            moved = np.asarray(np.linalg.solve(mass, moved), dtype=np.float64)
-            for rate in rates[:depth]:
-                moved = rate @ moved
-            return steps_along(gradients * scale, moved / scale[:, None], residual)
+            gradients = self.gradients(x, p)[np.ix_(rows, columns)] * scale
+            changes[groups[depth]] = function.evaluate(x, p)[depth].reshape(len(groups[depth]), -1)
+            along = changes[np.ix_(columns, self.layout.owners[rows])] / scale[:, None]
+            matrix = gradients @ along
+            is_kept = np.intersect1d(groups[depth], kept).size > 0
+            if is_kept or not np.isfinite(matrix).all() or rank_of(matrix) < len(rows):
+                return shortest_steps(gradients, residual)
+            sizes, units = equilibration(matrix)
+            inverse = np.linalg.inv(matrix / sizes[:, None] / units) / units[:, None] / sizes
+            return NewtonModel(lambda z: -along @ (inverse @ residual(z)), True)
 
         if not columns.size:
-            gradients = self.gradients(state, parameters)[rows] * self.scale
+            gradients = self.gradients(state, p)[rows] * self.scale
             allowed = CONSISTENT * np.linalg.norm(gradients, axis=1)
             return bool(np.all(np.abs(residual(np.zeros(0))) <= allowed))
         z, converged = newton(state[columns] / scale, linearize)
         state[columns] = scale * z
         return converged
-
-    @cached_property
-    def _groups(self) -> list[Indices]:
-        """The states whose rates contain constraint inputs, then those that depend on these."""
-        system = self.system
-        mass = nonzeros(system.mass_matrix.sparsity())
-        moved = nonzeros(system.g.sparsity()).any(axis=1)
-        for _ in range(system.num_states):
-            moved = moved | mass[:, moved].any(axis=1)
-        of_one = [bool(entry.is_one()) for entry in ca.vertsplit(ca.diag(system.mass_matrix))]
-        plain = (mass.sum(axis=1) == 1) & np.array(of_one)
-        uses = nonzeros(ca.jacobian_sparsity(system.f, system.state))
-        groups, following, taken = list[Indices](), moved, moved
-        while following.any() and len(groups) < max(self.layout.degrees, default=0):
-            groups.append(np.flatnonzero(following))
-            following = uses[:, groups[-1]].any(axis=1) & ~taken & plain
-            taken = taken | following
-        return groups
-
-    @cached_property
-    def _metric(self) -> tuple[TracedFunction, list[tuple[int, int]]]:
-        """M, the forces along velocities, and dq'/dv, d(q')/dq, ...; and their shapes."""
-        system, groups = self.system, [group.tolist() for group in self._groups]
-        moving = groups[0]
-        forces = system.frictional_contacts.without_friction(system.g)[moving, :]
-        outputs = {"mass": system.mass_matrix[moving, moving], "forces": forces}
-        for depth in range(1, len(groups)):
-            rates, by = system.f[groups[depth]], system.state[groups[depth - 1]]
-            outputs[f"rate{depth}"] = ca.jacobian(rates, by)
-        dense = {name: ca.densify(value) for name, value in outputs.items()}
-        shapes = [value.shape for value in outputs.values()]
-        return system.trace("kinetic metric", dense, often=False), shapes
-
-    def _metric_at(self, state: FloatArray, parameters: FloatArray) -> list[FloatArray]:
-        function, shapes = self._metric
-        values = zip(function.evaluate(state, parameters), shapes, strict=True)
-        return [value.copy().reshape(shape) for value, shape in values]
-
-    def _does_no_work(self, state: FloatArray, parameters: FloatArray) -> bool:
-        """Whether all constraint forces are along their gradients at a state."""
-        if not len(self._groups) == max(self.layout.degrees, default=0) > 0:
-            return False
-        forces = self._metric_at(state, parameters)[1]
-        gradients = self.gradients(state, parameters)
-        across = gradients[np.ix_(self.layout.ends, self._groups[0])].T
-        lengths = np.linalg.norm(across, axis=0), np.linalg.norm(forces, axis=0)
-        if not all(np.all(np.isfinite(length)) and np.all(length > 0.0) for length in lengths):
-            return False
-        basis, unit = across / lengths[0], forces / lengths[1]
-        residual = unit - basis @ np.linalg.lstsq(basis, unit, rcond=None)[0]
-        return bool(np.max(np.abs(residual)) <= ALONG)
 
 
 def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:

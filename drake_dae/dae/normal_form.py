@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, show, vector
 from drake_dae.dae.manifold import coordinates
-from drake_dae.dae.margins import RankMargin, find_margin
+from drake_dae.dae.margins import find_margin
 from drake_dae.dae.samples import Samples
 from drake_dae.dae.signals import Indices, Signal
 from drake_dae.dae.structure import (
@@ -22,7 +22,6 @@ from drake_dae.dae.structure import (
 )
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.numerics import NewtonModel, equilibration, newton, unit_rows
 
 # Single states complete the chains if the sine of their smallest angle is above this.
@@ -40,16 +39,14 @@ class NormalForm:
     both chains in the order of the system's constraints and outputs.
 
     Phi is a local diffeomorphism where its Jacobian is regular. By Theorem 2.1 the differentials of
-    both chains are independent wherever A(x) of Assumption (2) and B(x) of (16) are regular; if the
-    Jacobian is singular, A or B is, or xi does not complete the chains there. The paper allows any
-    completion; L_h* xi = 0 is not required. In all methods states, guesses and coordinates
-    (y, zeta, xi) have shape (n,), and `parameters` are those of all, the defaults if None.
+    both chains are independent wherever A(x) of Assumption (2) and B(x) of (16) are regular. The
+    paper allows any completion, L_h* xi = 0 is not required: xi are d = n - sum r_i - sum mu_i
+    states that complete the chains well at all of `structure.states`. In all methods states,
+    guesses and coordinates (y, zeta, xi) have shape (n,), and `parameters` are those of all, the
+    defaults if None.
 
     Args:
         system: The system (1)-(3).
-        completion: xi as expressions of the state (and parameters), shape (d, 1) with
-            d = n - sum r_i - sum mu_i. Chosen if None: states that complete the chains well at
-            all of `structure.states`.
         structure: The structure of the system; found if None.
 
     Attributes:
@@ -58,17 +55,10 @@ class NormalForm:
         margin: The margin of the Jacobian of Phi over `structure.states`.
 
     Raises:
-        ModelError: The completion does not fit, or its differentials are not independent of each
-            other and of the chains; no states complete them; or B(x) is singular.
+        ModelError: No states complete the chains at all of them, or B(x) is singular.
     """
 
-    def __init__(
-        self,
-        system: DaeSystem,
-        completion: ca.SX | None = None,
-        *,
-        structure: Structure | None = None,
-    ) -> None:
+    def __init__(self, system: DaeSystem, *, structure: Structure | None = None) -> None:
         structure = structure_of(system, structure, find_structure)
         self.structure, self.system = structure, system
         if structure.control_margin.is_singular:
@@ -79,18 +69,27 @@ class NormalForm:
             )
         chains = ca.vertcat(structure.manifold.residual_expression, structure.chain)  # (21)
         samples = Samples(structure.manifold, structure.states)
-        if completion is None:
-            completion = _chosen_completion(structure, chains, samples)
-        checked_one = _checked_completion(structure, chains, samples, completion)
-        self.completion, self.completion_signals, self.margin = checked_one  # (22)
+        chosen = _completing_states(structure, chains, samples)
+        self.completion = system.state[chosen, :]  # (22)
+        self.completion_signals = tuple(system.state_signals[i] for i in chosen)
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
             *structure.layout.chain_signals(system.output_signals),
             *self.completion_signals,
         )
         coordinates = ca.vertcat(chains, self.completion)  # (20)
-        outputs = {"y": coordinates, "jacobian": ca.jacobian(coordinates, system.state)}
-        self._map = system.trace("normal form and Jacobian", outputs)
+        jacobian = ca.jacobian(coordinates, system.state)
+        self.margin = find_margin(samples, jacobian)
+        if self.margin.is_singular:
+            raise ModelError(
+                f"{system.name}: Phi (20) is no change of coordinates at x = "
+                f"{show(self.margin.state)}: A(x) of Assumption (2) or B(x) of (16) is close to "
+                "singular there, or the states that complete the chains do not. Give `structure`, "
+                "found with a smaller spread"
+            )
+        self._map = system.trace(
+            "normal form and Jacobian", {"y": coordinates, "jacobian": jacobian}
+        )
         # Not the scale of `samples`, in which a state that is zero on N* is round-off.
         self._scale = structure.scale
 
@@ -123,7 +122,7 @@ class NormalForm:
         chain = ca.vertcat(structure.chain, 0)[1:, :]
         chain[layout.ends.tolist()] = highest[layout.dynamic.tolist(), :]
         moving = structure.derivatives.expand(structure.derivatives.rate)
-        rate = ca.jtimes(self.completion, dae.state, moving) + dae.exogenous.rate(self.completion)
+        rate = ca.jtimes(self.completion, dae.state, moving)
         values = ca.vertcat(chain, rate if self.completion.numel() else ca.SX(0, 1))  # (27)
         function = structure.trace("state realization", values, True)
         p = dae.parameter_vector(parameters)
@@ -148,19 +147,11 @@ class NormalForm:
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
         x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
         p = self.system.parameter_vector(parameters)
-        solution = self._newton(x, target, p)  # (24)
-        if solution is not None:
-            return solution
-        start, _ = self._at(x, p)
-        if not np.all(np.isfinite(start)):
-            raise ModelError(
-                f"{self.system.name}: the coordinates (20)-(22) are not finite at the guess "
-                f"{show(x)}; start inside the domain of the functions"
-            )
-        reached, stride = 0.0, 0.5
+        start, reached, stride = self._at(x, p)[0], 0.0, 1.0
         while reached < 1.0:
             share = min(1.0, reached + stride)
-            solution = self._newton(x, start + share * (target - start), p)
+            goal = target if share == 1.0 else start + share * (target - start)
+            solution = self._newton(x, goal, p)  # (24)
             if solution is not None:
                 x, reached, stride = solution, share, 2.0 * stride
             elif stride > 1e-4:
@@ -209,62 +200,15 @@ class NormalForm:
         return values, jacobian.reshape(values.size, -1)
 
 
-def _checked_completion(
-    structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX
-) -> tuple[ca.SX, tuple[Signal, ...], RankMargin]:
-    """A completion, with its signals and the margin of the Jacobian."""
-    system, count = structure.system, structure.zero_dynamics_dimension
-    if not isinstance(xi, ca.SX) or xi.shape != (count, 1):
-        got = f"shape {xi.shape}" if isinstance(xi, ca.SX) else type(xi).__name__
-        raise ModelError(
-            f"{system.name}: the completion must be a CasADi SX column of {count} expressions, "
-            f"n - sum r_i - sum mu_i; got {got}"
-        )
-    allowed = ca.vertcat(system.state, system.parameter_symbol)
-    unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(allowed, s)]
-    flaw = find_flaw(xi, system.state, system.parameter_symbol, "the state") if not unknown else ""
-    if unknown:
-        flaw = f"depends on {', '.join(unknown)}, which is neither a state nor a parameter"
-    if flaw:
-        raise ModelError(f"{system.name}: the completion {flaw}")
-    states = dict(zip(system.state_signals, ca.vertsplit(system.state), strict=True))
-    signals = tuple(
-        next((s for s, state in states.items() if ca.is_equal(entry, state)), Signal(f"xi{i}"))
-        for i, entry in enumerate(ca.vertsplit(xi))
-    )
-    gradient = ca.jacobian(ca.vertcat(chains, xi), system.state)
-    margin = find_margin(samples, gradient)
-    if not margin.is_singular:
-        return xi, signals, margin
-    text = (
-        "the differentials of the chains are dependent to round-off: A(x) of Assumption (2) or "
-        "B(x) of (16) is close to singular"
-    )
-    if count:
-        # By the distance of each differential from the span of those before it.
-        distances = np.abs(np.diag(np.linalg.qr((margin.matrix * samples.scale).T)[1]))
-        worst = int(np.argmin(distances[-count:]))
-        text = (
-            f"the completion '{signals[worst].name}' = {str(xi[worst])[:60]} is not independent of "
-            "the chains and of the rest of the completion; choose a function whose differential is "
-            "not in their span"
-        )
-    raise ModelError(f"{system.name}: {text} at x = {show(margin.state)}")
-
-
-def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) -> ca.SX:
+def _completing_states(structure: Structure, chains: ca.SX, samples: Samples) -> list[int]:
     """States whose differentials complete those of the chains well at all samples.
 
     They are regular on the null spaces of the chains' differentials: one QR with pivoting for all.
     """
     system, count = structure.system, structure.zero_dynamics_dimension
     gradients = samples.values(gradient=ca.jacobian(chains, system.state))
-    spaces = np.array(
-        [
-            np.linalg.svd(unit_rows(g * samples.scale))[2][system.num_states - count :].T
-            for (g,) in gradients
-        ]
-    )
+    rows = np.array([unit_rows(gradient * samples.scale) for (gradient,) in gradients])
+    spaces = np.linalg.svd(rows)[2][:, system.num_states - count :].transpose(0, 2, 1)
     rest, chosen = spaces.copy(), list[int]()
     for _ in range(count):
         # Rounded, so that ties go to the first state on every machine.
@@ -274,10 +218,10 @@ def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) ->
     sines = np.linalg.svd(spaces[:, sorted(chosen)], compute_uv=False)
     if sines.min(initial=1.0) <= TRANSVERSAL:
         raise ModelError(
-            f"{system.name}: no states complete the chains (20) at all states around the nominal "
-            f"one; give a completion of {count} expressions"
+            f"{system.name}: no {count} states complete the chains (20) at all states around the "
+            "nominal one; give `structure`, found with a smaller spread"
         )
-    return system.state[sorted(chosen), :]
+    return sorted(chosen)
 
 
 ComplexArray = np.typing.NDArray[np.complex128]

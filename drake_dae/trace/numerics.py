@@ -10,8 +10,7 @@ from math import sqrt
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-import scipy.linalg
-from scipy.linalg.lapack import dgeqrf, dorgqr, dpotrs, dtrtrs
+from scipy.linalg.lapack import dgeqrf, dorgqr, dtrtrs
 
 from drake_dae.arrays import FloatArray
 
@@ -236,23 +235,3 @@ def shortest_steps(
         inverse = np.linalg.pinv(rows, DEPENDENT)
         return NewtonModel(lambda x: -inverse @ (residual(x) / length), False)
     return NewtonModel(lambda x: -q @ dtrtrs(r, residual(x) / length, trans=1)[0], True)
-
-
-def steps_along(
-    gradients: FloatArray, directions: FloatArray, residual: Callable[[FloatArray], FloatArray]
-) -> NewtonModel | None:
-    """Returns the Newton model of steps D y, C D y = -residual(x), if y is determined."""
-    matrix = gradients @ directions
-    size = np.sqrt(np.abs(np.diag(matrix)))
-    if not (np.all(np.isfinite(matrix)) and np.all(size > 0.0)):
-        return None
-    try:
-        factors = scipy.linalg.cho_factor(matrix / size / size[:, None])
-    except np.linalg.LinAlgError:
-        return None
-    if np.min(np.diag(factors[0])) <= DEPENDENT:
-        return None
-    along = directions / size
-    return NewtonModel(
-        lambda x: -along @ dpotrs(factors[0], residual(x) / size, lower=factors[1])[0], True
-    )
