@@ -113,7 +113,7 @@ def check_force_loop(
                 "time_constant or a sample_period"
             )
         return
-    gain = float(np.linalg.norm(measured.gain, 2)) if measured and measured.gain.size else 0.0
+    gain = measured.gain if measured else 0.0
     lag, samples = sensor.time_constant, sensor.sample_period
     loops = [(samples, 0)] if samples else []
     if sampling is not None and at_once:
@@ -126,7 +126,7 @@ def check_force_loop(
         polynomial[-1] += (1.0 - a) * gain
         if (radius := np.max(np.abs(np.roots(polynomial)), initial=0.0)) >= 1.0:
             raise WiringError(
-                f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample of "
+                f"the sampled force loop diverges: with Gbar = {gain:.3g} each sample of "
                 f"{period:g} s multiplies the force error by {radius:.3g}. Lower force_gain, or "
                 "give the sensor a time_constant well above the period of samples and the delay"
             )

@@ -320,8 +320,7 @@ class Law:
         contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
             of forces change within periods of the contact: its deflection is then fed ahead. It
             needs rigid joints, and references, no task.
-        force_gain: Gbar of (59), a number or a matrix row by row, with `sensors.force`; for rigid
-            joints only.
+        force_gain: Gbar of (59), 0 or more, with `sensors.force`; for rigid joints only.
         control_weights: One weight per actuator, if there are more actuators than outputs. The law
             then chooses the control with the least sum of weight * (u - free_control)^2. The
             parameter "free_control" is zero unless it is in `exogenous`.
@@ -336,7 +335,7 @@ class Law:
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
     contact_stiffness: float | None = None
-    force_gain: ArrayLike = 0.0
+    force_gain: float = 0.0
     control_weights: list[float] = field(default_factory=list)
     largest_roughness: Positive | None = None
     largest_errors: LargestErrors | None = None

@@ -15,9 +15,9 @@ from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.references import ConstantReference
 from drake_dae.references.by_name import assign, in_order
+from drake_dae.references.reference import stacked_expression
 from drake_dae.systems.controller import SIGNAL, law_block
 from drake_dae.systems.phases import Moment
-from drake_dae.systems.references import traced_references
 from drake_dae.systems.task import CONTACT, FREE, Task
 
 CHANGE = (
@@ -172,7 +172,7 @@ class Automaton:
             is_free = np.isin(np.arange(len(names)), named, invert=True)
             at_rest, unnamed = ConstantReference(0.0), np.flatnonzero(is_free)
             found += [assign(names[i], at_rest, names, law.degrees) for i in unnamed]
-            row = traced_references(in_order(found, names), law.degrees, time)
+            row = stacked_expression(in_order(found, names), law.degrees, time)
         except ReferenceSignalError as error:
             raise ModelError(f"{where}: {error}") from error
         start, now = (ca.substitute(row, time, at) for at in (ca.SX(0), self.passed))

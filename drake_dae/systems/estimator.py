@@ -13,8 +13,8 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae import Lags, Observation, Signal, TrackingLaw
 from drake_dae.dae.disturbance import (
     DISTURBANCE,
-    ChainFilter,
     estimated_within,
+    filter_gain,
     orthogonal_part,
     shares,
 )
@@ -49,7 +49,7 @@ class StateEstimator(ParameterizedSystem):
 
         q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,    e = qm - q,
 
-    with the gains of the stationary Kalman filter of each position, `ChainFilter`.
+    with the gains of the stationary Kalman filter of each position, `filter_gain`.
 
     **Friction** takes its share of r, mu' = k_f (c . r) / (c . c) with c = S^T dg/dmu v. Parameters
     that `with_disturbance` made exogenous, and friction beside them, follow by `ParameterFilter`.
@@ -566,6 +566,6 @@ def _gains(
     for which, rate in enumerate(rates):
         for i, (q, v) in enumerate(zip(*deviations, strict=True)):
             ratio = v / q if v > 0.0 and q > 0.0 else None
-            own = ChainFilter.of(state_rate, rate, period, ratio).gain
+            own = filter_gain(state_rate, rate, period, ratio)
             found[which, :, i, : own.shape[1]] = own
     return [[ca.DM(each) for each in gains] for gains in found]

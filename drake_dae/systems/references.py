@@ -17,7 +17,7 @@ from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import Reference, ReferenceRows
-from drake_dae.references.reference import with_degrees
+from drake_dae.references.reference import stacked_expression
 from drake_dae.references.splines import PiecewisePolynomials
 from drake_dae.trace.functions import FailureKind
 
@@ -60,32 +60,10 @@ def reference_block(references: Sequence[Reference], degrees: Sequence[int]) -> 
         raise ReferenceSignalError(
             f"the references cover {covered} outputs, the law has {len(degrees)}"
         )
-    wholes = map(_whole, references)
+    wholes = (r.reference if isinstance(r, ReferenceRows) else r for r in references)
     ranges = (each.range for each in wholes if isinstance(each, TrajectoryReference))
-    outputs = {"reference": traced_references(references, degrees, TIME)}
+    outputs = {"reference": stacked_expression(references, degrees, TIME)}
     return Block("reference", outputs=outputs, requirements=tuple(ranges))
-
-
-def traced_references(
-    references: Sequence[Reference], degrees: Sequence[int], time: ca.SX
-) -> ca.SX:
-    """R(t) of references at a symbolic time, shape (sum (mu_i + 1), 1)."""
-    rows = [ca.SX(0, 1)]
-    for reference, its_degrees in with_degrees(references, degrees):
-        row = reference.expression(its_degrees, time)
-        if row is None:
-            raise ReferenceSignalError(
-                f"a {type(_whole(reference)).__name__} is no expression of time: define its "
-                "`expression`, or take an ExpressionReference, or wire a system of your own to the "
-                "controller's port 'reference'"
-            )
-        rows.append(row)
-    return ca.vertcat(*rows)
-
-
-def _whole(reference: Reference) -> Reference:
-    """The reference of which this one may be some rows."""
-    return reference.reference if isinstance(reference, ReferenceRows) else reference
 
 
 @checked(ReferenceSignalError)

@@ -41,8 +41,7 @@ def test_forms_that_no_shipped_scenario_has_read_back_equal(tmp_path):
         ],
         sensors=forms.Sensors(force=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0])),
         law=forms.Law(
-            forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]),
-            force_gain=np.eye(2),
+            forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]), force_gain=2.0
         ),
         references={
             "c.d, e": dd.PointToPointReference([0.0], [1.0], 0.5, 2.0, 4),
