@@ -125,6 +125,7 @@ limit@screw: || effort
 dynamics: damping | coulomb_window friction=0
 dynamics@floating: | damping=0
 mimic: joint multiplier offset
+visual: *
 material: name color | *
 transmission: type=simple joint actuator | name mechanicalReduction plugin param
 transmission: | use_simulated_gripper_joint
@@ -154,6 +155,7 @@ joint@revolute,prismatic,continuous,ball,fixed,screw: | axis2
 joint@revolute,prismatic,continuous,ball,fixed,universal: | thread_pitch
 axis axis2: xyz limit dynamics use_parent_model_frame | initial_position
 axis2: | dynamics=never
+visual drake:visual: *
 material: ambient diffuse specular emissive | *
 limit: lower upper effort velocity drake:acceleration | stiffness dissipation
 limit@ball,universal,screw: || lower upper velocity drake:acceleration
