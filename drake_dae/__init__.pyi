@@ -1,6 +1,6 @@
 """The public names, in the order of the paper; they are loaded when they are asked for.
 
-All else is imported from its room, as `from drake_dae.robots import RollingBall`.
+All else is imported from its room, as `from drake_dae.robots import KnownForce`.
 """
 
 from . import errors as errors

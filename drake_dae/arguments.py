@@ -18,9 +18,6 @@ from drake_dae.arrays import all_finite, brief, number, numbers
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-Problem = tuple[str, str, Any]
-"""Where a value is not what an annotation says, what would be right there, and what it is."""
-
 
 class _Uncollected(ContextDecorator):
     """Meanwhile no thread collects garbage by itself.
@@ -61,14 +58,12 @@ uncollected = _Uncollected()
 
 
 def checked(error: Callable[[str], Exception], lasts: bool = False) -> Callable[[F], F]:
-    """Decorates a public name so that arguments which do not match their annotations raise.
+    """Decorates a public name so that arguments which do not match their annotations raise `error`.
 
     Of a class, the constructor and the class methods are decorated; what it makes keeps copies of
-    the caller's arrays. A number must be finite and not a bool, text is no list of letters, and the
-    entries of lists and dictionaries are checked as well. Shapes and ranges are left to the
-    function. A default is always accepted. A check takes some 10 us: nothing that is called in a
-    loop has one. `error` makes the exception of "<name>: <argument> must be <condition>, got ...".
-    Meanwhile garbage is `uncollected`, unless the function `lasts`.
+    the caller's arrays. Numbers must be finite; entries of lists and dictionaries are checked as
+    well; defaults are always accepted. A check takes some 10 us: nothing that is called in a loop
+    has one. Meanwhile garbage is `uncollected`, unless the function `lasts`.
     """
 
     def decorate(target: F) -> F:
@@ -113,7 +108,8 @@ def _own(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
-def _problems(hint: Any, value: Any, place: str = "") -> list[Problem]:
+def _problems(hint: Any, value: Any, place: str = "") -> list[tuple[str, str, Any]]:
+    """Where a value is not what an annotation says, what would be right there, and what it is."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType) and hint != ArrayLike:
         if set(parts) >= _ARRAY:
@@ -151,10 +147,6 @@ def _rule(hint: Any) -> tuple[str, Callable[[Any], object]]:
         return " or ".join(map(repr, words)), lambda v: isinstance(v, str) and v in words
     if hint is Any or not inspect.isclass(hint):  # Any is a class, too.
         return "anything", lambda v: True
-    if getattr(hint, "_is_protocol", False):
-        names = [name for kind in hint.__mro__ for name in vars(kind) if name[0] != "_"]
-        has = inspect.getattr_static  # It evaluates no property, and an attribute may be None.
-        return f"a {hint.__name__}", lambda v: all(has(v, n, _RULES) is not _RULES for n in names)
     return f"a {hint.__name__}", lambda v: isinstance(v, hint)
 
 

@@ -1,4 +1,4 @@
-"""Arrays of numbers: checks of arguments, and formatting for messages."""
+"""Arrays of numbers: checks of arguments, which raise ModelError, and formatting for messages."""
 
 import re
 from collections.abc import Iterable
@@ -26,16 +26,7 @@ def all_finite(array: np.ndarray) -> bool:
 
 
 def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> FloatArray:
-    """Converts real numbers to a new array; refuses text and masked entries, accepts nan and inf.
-
-    Args:
-        what: Their name in messages.
-        value: The numbers, in any shape.
-        error: The class of exception to raise.
-
-    Raises:
-        ModelError: The value contains something else, or rows of different lengths.
-    """
+    """Converts real numbers to a new array; refuses text and masked entries, not nan and inf."""
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value.copy()
     try:
@@ -55,10 +46,8 @@ def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> Float
 
 
 def number_in(text: str) -> float | None:
-    """Returns the finite number that a text contains, as in JSON or with a sign; else None.
-
-    Python's float also accepts "1_0", "nan" and digits of other alphabets.
-    """
+    """Returns the finite number that a text contains, as in JSON or with a sign; else None."""
+    # Python's float also accepts "1_0", "nan" and digits of other alphabets.
     if not _NUMBER.fullmatch(text.strip(" \t")):
         return None
     value = float(text)
@@ -73,24 +62,8 @@ def can_be_written(text: str) -> bool:
     return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
-def check_writable(what: str, text: str) -> None:
-    """Checks that a text can be written to a file.
-
-    Raises:
-        ModelError: It contains a lone surrogate.
-    """
-    if not can_be_written(text):
-        raise ModelError(
-            f"{what} has half of a letter (\\ud800 to \\udfff), which no file can hold: {text!a}"
-        )
-
-
 def number(what: str, value: Any, error: type[Exception] = ModelError) -> float:
-    """Converts a finite real number to a float.
-
-    Raises:
-        ModelError: It is not such a number.
-    """
+    """Converts a finite real number to a float."""
     array = numbers(what, value, error)
     if array.shape != () or not np.isfinite(array):
         raise error(f"{what} must be a finite number, got {brief(value)}")
@@ -98,11 +71,7 @@ def number(what: str, value: Any, error: type[Exception] = ModelError) -> float:
 
 
 def positive(what: str, value: Any, error: type[Exception] = ModelError) -> float:
-    """Converts a finite real number above 0 to a float.
-
-    Raises:
-        ModelError: It is not such a number.
-    """
+    """Converts a finite real number above 0 to a float."""
     checked = number(what, value, error)
     if checked <= 0.0:
         raise error(f"{what} must be positive, got {brief(value)}")
@@ -112,11 +81,7 @@ def positive(what: str, value: Any, error: type[Exception] = ModelError) -> floa
 def vector(
     what: str, value: Any, size: int | None, error: type[Exception] = ModelError
 ) -> FloatArray:
-    """Converts finite real numbers to a new array of shape (size,); of any length if size is None.
-
-    Raises:
-        ModelError: The numbers have another shape, or one of them is not finite.
-    """
+    """Converts finite real numbers to shape (size,); of any length if size is None."""
     array = numbers(what, value, error)
     if array.ndim != 1 or size not in (None, array.size) or not all_finite(array):
         expected = "one-dimensional" if size is None else f"of shape ({size},)"
@@ -125,37 +90,28 @@ def vector(
     return array
 
 
-def check_whole_number(what: str, value: Any, least: int) -> None:
-    """Checks that a value is a whole number of at least `least`.
+def each(what: str, value: Any, size: int) -> FloatArray:
+    """Converts finite numbers, one for each of `size` items or one for all, to shape (size,)."""
+    array = numbers(what, value)
+    if array.shape not in ((), (size,)) or not all_finite(array):
+        raise ModelError(f"{what} must be a finite number or shape ({size},), got {brief(value)}")
+    return np.broadcast_to(array, (size,)).copy()
 
-    Raises:
-        ModelError: The value is too small, or not a whole number.
-    """
+
+def check_whole_number(what: str, value: Any, least: int) -> None:
+    """Checks that a value is a whole number of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ModelError(f"{what} must be a whole number from {least}, got {brief(value)}")
 
 
-def check_axes(name: str, axes: str) -> None:
-    """Checks that a text consists of distinct letters of "xyz".
-
-    Raises:
-        ModelError: A letter is another one, or occurs twice, or there is none.
-    """
-    if not axes or any(a not in "xyz" for a in axes) or len(set(axes)) != len(axes):
-        raise ModelError(f"{name} must be distinct letters of x, y, z, got '{axes}'")
+def check_axes(name: str, axes: str, letters: str = "xyz") -> None:
+    """Checks that a text has at least one letter, each once; ModelError if not."""
+    if not axes or not set(axes) <= set(letters) or len(set(axes)) != len(axes):
+        raise ModelError(f"{name} must be distinct letters of {', '.join(letters)}, got '{axes}'")
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """Returns the text for an unknown name, with the known names.
-
-    Args:
-        kind: The kind of the name, for example "frame".
-        name: The unknown name.
-        known: The valid names.
-
-    Returns:
-        A text such as "no frame 'tol'; did you mean 'tool'? there are base, tool".
-    """
+    """A text such as "no frame 'tol'; did you mean 'tool'? there are base, tool"."""
     names = list(known)
     near = get_close_matches(str(name), names, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""

@@ -107,8 +107,10 @@ class SimulationError(DrakeDaeError):
         self.state = _array(state)
 
     def retold(self, message: str, time: float, state: ArrayLike) -> SimulationError:
-        """The same error with another text, time and state."""
-        return type(self)(message, time, state)
+        """The same error, its other data kept, with another text, time and state."""
+        error = type(self)(message, time, state)
+        vars(error).update({**vars(self), **vars(error)})
+        return error
 
 
 class SingularityError(SimulationError):
@@ -120,11 +122,6 @@ class SingularityError(SimulationError):
     """
 
     constraints: tuple[str, ...] = ()
-
-    def retold(self, message: str, time: float, state: ArrayLike) -> SimulationError:
-        error = super().retold(message, time, state)
-        vars(error).update(constraints=self.constraints)
-        return error
 
 
 class PainleveError(SingularityError):

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import stat
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -25,11 +24,8 @@ MOST_RECORDED = 1 << 31
 
 def open_file(path: str | Path) -> BinaryIO:
     """Opens a file for reading: no pipe, which may block for ever, and no device without end."""
-    mode = os.stat(path).st_mode
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    if not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, "it is a pipe or a device, and no file", str(path))
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OSError(errno.EINVAL, "it is a directory, a pipe or a device", str(path))
     return open(path, "rb")
 
 
@@ -96,9 +92,8 @@ def check_unwritten(files: Iterable[Path], force: bool) -> None:
     there = [path for path in files if os.path.lexists(path)]
     for path in there:
         if path.is_symlink() or not path.is_file():
-            kind = "a link" if path.is_symlink() else "a folder" if path.is_dir() else "a device"
-            raise ModelError(f"'{path}' is {kind}, which is never replaced; choose another name")
+            text = "is a link, a folder or a device, which is never replaced; choose another name"
+            raise ModelError(f"'{path}' {text}")
     if there and not force:
         names = ", ".join(f"'{path}'" for path in there)
-        are = "exists, and is" if len(there) == 1 else "exist, and are"
-        raise ModelError(f"{names} {are} not overwritten; choose another name, or --force")
+        raise ModelError(f"not overwritten: {names}; choose another name, or --force")

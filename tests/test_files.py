@@ -1,6 +1,5 @@
 """Files that a user names: what is none, or holds what it should not, is refused in a sentence."""
 
-import json
 import os
 import signal
 import tracemalloc
@@ -12,7 +11,6 @@ import pytest
 from runs import scenario
 
 from drake_dae import CsvReference, MeasuredSurface, Record, load_scenario, new_scenario
-from drake_dae.dae import Signal
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.files import read_bytes, read_text
 from drake_dae.scenario.robot_file.reading import read_robot
@@ -204,16 +202,6 @@ def test_a_robot_that_includes_itself_is_refused(files, chain, tmp_path):
 def test_a_name_that_no_file_can_hold_is_refused(setting):
     with pytest.raises(ScenarioError, match=r"\\ud"):
         scenario("two_link_wall", setting)
-
-
-def test_a_signal_has_a_name_that_a_record_can_hold(tmp_path):
-    with pytest.raises(ModelError, match=r"'\\ud800'"):
-        Signal("\ud800")
-    name = "\u00fc \U0001f916"
-    record = Record(np.arange(2.0), {})
-    record.save(tmp_path / "record.npz")
-    assert Signal(name).derivative(1).name == f"{name}'"
-    assert json.dumps(Record.load(tmp_path / "record.npz").about)
 
 
 def test_the_length_of_a_path_does_not_matter(tmp_path):

@@ -17,5 +17,4 @@ from .tables import Part as Part
 from .tables import Table as Table
 from .tables import count_of as count_of
 from .tables import digits as digits
-from .tables import to_markdown as to_markdown
 from .tables import to_text as to_text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,19 +12,9 @@ from numpy.typing import ArrayLike
 from drake_dae.analysis.report import Analysis, Assumption, Finding
 from drake_dae.analysis.tables import count_of
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, check_whole_number, numbers
-from drake_dae.dae import (
-    ConstraintStructure,
-    DaeSystem,
-    Manifold,
-    RankMargin,
-    Stability,
-    Violation,
-    ZeroDynamics,
-    why_no_law,
-)
+from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.dae import DaeSystem, RankMargin, Stability, Violation, ZeroDynamics, why_no_law
 from drake_dae.dae.margins import ContactMargins, find_margin
-from drake_dae.dae.samples import Samples
 from drake_dae.dae.structure import (
     check_system,
     constraint_violation,
@@ -32,7 +22,7 @@ from drake_dae.dae.structure import (
     examine_constraints,
     examine_outputs,
 )
-from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
+from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.references import Reference
 
 STATEMENTS = (
@@ -47,15 +37,11 @@ STATEMENTS = (
 COUNT, SEED = 50, 0
 """The number of random states that are examined by default, and the seed of their numbers."""
 
-NEIGHBOURS = 5
-"""How many states are added close to the first given one, which may be a zero of a function."""
-
 
 @checked(ModelError)
 def analyze(
     system: DaeSystem,
     *,
-    states: ArrayLike | None = None,
     reference: Callable[[float], FloatArray] | None = None,
     times: ArrayLike | None = None,
     start: ArrayLike | None = None,
@@ -66,9 +52,9 @@ def analyze(
 ) -> Analysis:
     """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, also along a reference.
 
-    Numbers are decided at consistent states with the default parameters: at those given, or at
-    random ones around `system.nominal_state`. Degrees must be the same for all
-    numbers that parameters may have, see `DaeSystem.with_bounds`. A determinant that changes its
+    Numbers are decided at random consistent states around `system.nominal_state`, with the default
+    parameters. Degrees must be the same for all numbers that parameters may have, see
+    `DaeSystem.with_bounds`. A determinant that changes its
     sign between the first state and another one is zero on the way. From the worst of the random
     ones the smallest singular values of A(x) and B(x) are also followed downhill, inside
     the box that the random states span, so that a singular state between them is found as a
@@ -80,8 +66,6 @@ def analyze(
 
     Args:
         system: The system (1)-(3).
-        states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
-            few others close to the first, since an expression may vanish at a single state.
         reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
             the motion that it commands, and the zero dynamics judged at its first outputs.
         times: Times in s at which the reference is examined, increasing, shape (k,).
@@ -98,8 +82,7 @@ def analyze(
         The report. An assumption that is violated is part of it, with what is known before.
 
     Raises:
-        InconsistentStateError: There is no consistent state around the nominal state, or given
-            states are not consistent.
+        InconsistentStateError: There is no consistent state around the nominal state.
         ModelError: Arguments make no sense, or the system has a function that is not finite, or a
             mass matrix that is not symmetric and positive definite.
     """
@@ -110,106 +93,28 @@ def analyze(
             raise ModelError(f"{system.name}: {name} is that of a reference, and none is given")
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
-    random = np.random.default_rng(seed)
-    chosen = (
-        ExaminedStates.drawn(system, count, random)
-        if states is None
-        else ExaminedStates.given(system, states, random)
-    )
-    analysis = examine(system, chosen)
-    if reference is None or times is None:
-        return _at_rest(analysis)
+    analysis = examine(system, count, seed)
     return along(analysis, reference, times, start, period, exogenous)
 
 
-def examine(system: DaeSystem, chosen: ExaminedStates | None = None) -> Analysis:
+def examine(system: DaeSystem, count: int = COUNT, seed: int = SEED) -> Analysis:
     """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics."""
-    if chosen is None:
-        chosen = ExaminedStates.drawn(system, COUNT, np.random.default_rng(SEED))
-    given_states = chosen.guesses[: chosen.num_given]
+    # The states.
+    nominal, random = system.nominal_state, np.random.default_rng(seed)
+    drawn = system.spread_around(nominal) * random.standard_normal((count, nominal.size))
+    guesses = np.vstack([nominal, nominal + drawn])
     try:
         check_system(system)
-        constrained, around = examine_constraints(system, chosen.guesses)
+        constrained, samples = examine_constraints(system, guesses)
     except AssumptionError as error:
-        where = chosen.describe(len(chosen.guesses), "state")
-        tried = given_states if chosen.num_given else chosen.guesses
-        return Analysis(system, where, tried, _assumptions((), [error.violation]))
-    samples = around
-    if chosen.num_given:
-        # Degrees are decided also at states around them, margins only at them.
-        samples = Samples(around.manifold, given_states)
-        _check_consistent(samples.manifold, given_states, samples.states)
-    where = chosen.describe(len(samples.states), "consistent state")
-    return _examine(constrained, around, samples, where, search=not chosen.num_given)
+        where = f"{count_of(len(guesses), 'state')} around the nominal one"
+        return Analysis(system, where, guesses, _assumptions((), [error.violation]))
+    where = f"{count_of(len(samples.states), 'consistent state')} around the nominal one"
+    if left_out := len(guesses) - len(samples.states):
+        where += f"; {left_out} more were outside the domain or off N*"
 
-
-def _at_rest(analysis: Analysis) -> Analysis:
-    """Adds the zero dynamics at rest, where there is a structure."""
-    if analysis.structure is None:
-        return analysis
-    dynamics, states = ZeroDynamics(analysis.system, structure=analysis.structure), analysis.states
-    stability = dynamics.stability(states[0])
-    equilibria = _equilibria(dynamics, stability, states, None)
-    return replace(analysis, zero_dynamics=stability, equilibria=equilibria)
-
-
-def along(
-    analysis: Analysis,
-    reference: Callable[[float], FloatArray],
-    times: ArrayLike,
-    start: ArrayLike | None,
-    period: float | None,
-    exogenous: Sequence[Reference],
-) -> Analysis:
-    """Adds what `analyze` says along a reference, where there is a structure."""
-    system, states, structure = analysis.system, analysis.states, analysis.structure
-    if structure is None:
-        return analysis
-    dynamics = ZeroDynamics(system, structure=structure)
-    guess = states[0] if start is None else start
-    motion = dynamics.motion(reference, times, guess, exogenous=exogenous)
-    rest, outputs = states[0], None
-    if motion.times.size:
-        # The state does not determine outputs with mu_i = 0: they are taken from the start of the
-        # reference.
-        rest = motion.states[0]
-        outputs = structure.layout.values(reference(float(motion.times[0])))
-    stability = dynamics.stability(rest, outputs=outputs)
-    stability_along = None
-    if dynamics.dimension and period is not None:
-        stability_along = dynamics.stability_along(reference, motion, period, exogenous=exogenous)
-    contact_margin_along = None
-    if system.frictional_contacts and motion.times.size:
-        contacts = ContactMargins(system, structure.elimination.constraint_matrix)
-        contact_margin_along = contacts.along(motion.times, motion.states, motion.parameters)
-    return replace(
-        analysis,
-        motion=motion,
-        contact_margin_along=contact_margin_along,
-        zero_dynamics=stability,
-        equilibria=_equilibria(dynamics, stability, states, outputs),
-        zero_dynamics_along=stability_along,
-    )
-
-
-def _equilibria(
-    dynamics: ZeroDynamics, stability: Stability, states: FloatArray, outputs: FloatArray | None
-) -> tuple[Stability, ...]:
-    """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
-    if not dynamics.dimension:
-        return ()
-    judged: tuple[Stability, ...] = ()
-    if stability.state is not None and len(dynamics.equilibria([stability.state], None, outputs)):
-        judged, states = (stability,), np.vstack([stability.state, states])
-    others = dynamics.equilibria(states, outputs=outputs)[len(judged) :]
-    return (*judged, *(dynamics.stability(state, outputs=outputs) for state in others))
-
-
-def _examine(
-    constrained: ConstraintStructure, around: Samples, samples: Samples, where: str, search: bool
-) -> Analysis:
-    """Examines degrees at some samples and margins at others, without zero dynamics."""
-    system, elimination = samples.system, constrained.elimination
+    # The constraints.
+    elimination = constrained.elimination
     results: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
     margins: dict[int, RankMargin] = {}
     violations: list[Violation] = []
@@ -223,7 +128,7 @@ def _examine(
 
     if constrained.constraint_margin is not None:
         matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
-        margin = find_margin(samples, matrix, search=search)
+        margin = find_margin(samples, matrix, search=True)
         constrained = replace(constrained, constraint_margin=margin)
         judge(margin, constraint_violation(constrained), 2)
         regular = margin.is_regular_at_samples
@@ -231,17 +136,19 @@ def _examine(
         results["constraint_structure"] = constrained
         if system.frictional_contacts:
             margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
-            results["contact_margin"] = margins_of_contacts.over(samples, search)
+            results["contact_margin"] = margins_of_contacts.over(samples, search=True)
+
+    # The outputs.
     without_law = why_no_law(system)
     if regular and not without_law:
         try:
-            structure = examine_outputs(constrained, around)
+            structure = examine_outputs(constrained, samples)
         except AssumptionError as error:
             violations.append(error.violation)
         else:
             matrix = structure.control_matrix
             satisfied |= {4, 5}
-            margin = find_margin(samples, matrix, structure.round_off, search)
+            margin = find_margin(samples, matrix, structure.round_off, search=True)
             structure = replace(structure, control_margin=margin)
             judge(margin, control_violation(structure), 5)
             results["output_degrees"] = structure.output_degrees
@@ -249,6 +156,54 @@ def _examine(
                 results["structure"] = structure
     assumptions = _assumptions(satisfied, violations, margins, without_law)
     return Analysis(system, where, samples.states, assumptions, **results)
+
+
+def along(
+    analysis: Analysis,
+    reference: Callable[[float], FloatArray] | None = None,
+    times: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    period: float | None = None,
+    exogenous: Sequence[Reference] = (),
+) -> Analysis:
+    """Adds zero dynamics, and what `analyze` says along a reference, if there is a structure."""
+    system, states, structure = analysis.system, analysis.states, analysis.structure
+    if structure is None:
+        return analysis
+    dynamics, found = ZeroDynamics(system, structure=structure), dict[str, Any]()
+    rest, outputs = states[0], None
+    if reference is not None and times is not None:
+        guess = states[0] if start is None else start
+        motion = found["motion"] = dynamics.motion(reference, times, guess, exogenous=exogenous)
+        if motion.times.size:
+            # The state does not determine outputs with mu_i = 0: they are taken from the start of
+            # the reference.
+            rest = motion.states[0]
+            outputs = structure.layout.values(reference(float(motion.times[0])))
+            if system.frictional_contacts:
+                contacts = ContactMargins(system, structure.elimination.constraint_matrix)
+                margin = contacts.along(motion.times, motion.states, motion.parameters)
+                found["contact_margin_along"] = margin
+        if dynamics.dimension and period is not None:
+            found["zero_dynamics_along"] = dynamics.stability_along(
+                reference, motion, period, exogenous=exogenous
+            )
+    stability = dynamics.stability(rest, outputs=outputs)
+    equilibria = _equilibria(dynamics, stability, states, outputs)
+    return replace(analysis, zero_dynamics=stability, equilibria=equilibria, **found)
+
+
+def _equilibria(
+    dynamics: ZeroDynamics, stability: Stability, states: FloatArray, outputs: FloatArray | None
+) -> tuple[Stability, ...]:
+    """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
+    if not dynamics.dimension:
+        return ()
+    judged: tuple[Stability, ...] = ()
+    if stability.state is not None and len(dynamics.equilibria([stability.state], None, outputs)):
+        judged, states = (stability,), np.vstack([stability.state, states])
+    others = dynamics.equilibria(states, outputs=outputs)[len(judged) :]
+    return (*judged, *(dynamics.stability(state, outputs=outputs) for state in others))
 
 
 def _assumptions(
@@ -272,61 +227,3 @@ def _assumptions(
         violation = violated.get(number)
         result.append(Assumption(number, statement, finding, margin, reason, violation))
     return tuple(result)
-
-
-@dataclass(frozen=True, eq=False)
-class ExaminedStates:
-    """The states that an analysis starts from: random ones, or those given and some beside."""
-
-    guesses: FloatArray
-    num_given: int
-
-    @classmethod
-    def drawn(cls, system: DaeSystem, count: int, random: np.random.Generator) -> ExaminedStates:
-        nominal = system.nominal_state
-        drawn = nominal + system.spread_around(nominal) * random.standard_normal(
-            (count, nominal.size)
-        )
-        return cls(np.vstack([nominal, drawn]), 0)
-
-    @classmethod
-    def given(
-        cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
-    ) -> ExaminedStates:
-        rows = numbers(f"{system.name}: states", states)
-        shape = (len(rows) if rows.ndim else 0, system.num_states)
-        if rows.shape != shape or not rows.size or not np.all(np.isfinite(rows)):
-            raise ModelError(
-                f"{system.name}: states must be finite numbers of shape (k, {system.num_states}), "
-                f"got {states!r}"
-            )
-        around = system.spread_around(rows[0]) * random.standard_normal((NEIGHBOURS, shape[1]))
-        return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows))
-
-    def describe(self, count: int, noun: str) -> str:
-        if self.num_given:
-            return f"{count_of(self.num_given, noun)} as given"
-        left_out = len(self.guesses) - count
-        missing = f"; {left_out} more were outside the domain or off N*" if left_out else ""
-        return f"{count_of(count, noun)} around the nominal one{missing}"
-
-
-def _check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:
-    """Checks that the user's states are consistent and inside the domain of the system."""
-    name = manifold.system.name
-    for number, state in enumerate(states):
-        if not manifold.is_consistent(state):
-            residual = manifold.residual(state)
-            worst = int(np.argmax(np.abs(residual)))
-            raise InconsistentStateError(
-                f"{name}: states[{number}] is not consistent: "
-                f"{manifold.residual_signals[worst].name} = {residual[worst]:.3g}; project it, for "
-                "example with `find_structure(system).manifold.project`",
-                residual,
-            )
-        near = 1e-4 * np.maximum(np.abs(state), np.abs(projected).max(axis=0))
-        if not np.any(np.all(np.abs(projected - state) <= near, axis=1)):
-            raise ModelError(
-                f"{name}: states[{number}] is outside the domain: functions of (1)-(3) are not "
-                "finite there"
-            )

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -15,6 +16,7 @@ from drake_dae.dae.pinned_motion import PinnedOutputs, PinnedSet
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.robots import FrictionCone, RobotModel
+from drake_dae.trace.functions import TracedFunction
 
 SLACK, CLOSE = 1e-9, 1e-6
 """The share by which a limit may be passed, since a start may be on it; and the relative accuracy
@@ -79,8 +81,8 @@ class SignalRange:
     @property
     def share(self) -> float:
         """How much of the half range between its limits is used; nan without both limits."""
-        with np.errstate(invalid="ignore"):
-            return float(1.0 - np.float64(2.0 * self.room) / (self.high - self.low))
+        width = self.high - self.low
+        return 1.0 - 2.0 * self.room / width if np.isfinite(width) else np.nan
 
     @property
     def excess(self) -> Excess | None:
@@ -104,6 +106,7 @@ class SignalRange:
         }
 
 
+@dataclass(frozen=True, eq=False)
 class SignalLimits:
     """Limits low <= s <= high of k signals s(x, u, lambda), where lambda are all constraint forces.
 
@@ -111,32 +114,37 @@ class SignalLimits:
     high, shape (2, k), infinite without a limit.
     """
 
-    def __init__(
-        self,
-        system: DaeSystem,
-        signals: Sequence[Signal],
-        kinds: Sequence[LimitKind],
-        values: ca.SX,
-        bounds: FloatArray,
-        symbols: tuple[ca.SX, ca.SX],
-    ) -> None:
-        self.system, self.bounds = system, bounds
-        self.signals, self.kinds = tuple(signals), tuple(kinds)
-        (u, force), v, values = symbols, ca.SX.sym("v", system.num_constraints), ca.densify(values)
-        self._values = system.trace("limited", {"s": values}, {"u": u, "force": force})
-        pinned = {"s": ca.substitute(values, force, system.forces(v))}
-        self.pinned_values = system.trace("limited", pinned, {"u": u, "v": v})
+    system: DaeSystem
+    signals: Sequence[Signal]
+    kinds: Sequence[LimitKind]
+    values: ca.SX
+    bounds: FloatArray
+    symbols: tuple[ca.SX, ca.SX]
+
+    @cached_property
+    def _recorded(self) -> TracedFunction:
+        u, force = self.symbols
+        return self.system.trace(
+            "limited", {"s": ca.densify(self.values)}, {"u": u, "force": force}
+        )
+
+    @cached_property
+    def pinned(self) -> TracedFunction:
+        """s as a function of x, u and the constraint inputs v."""
+        (u, force), v = self.symbols, ca.SX.sym("v", self.system.num_constraints)
+        values = ca.substitute(ca.densify(self.values), force, self.system.forces(v))
+        return self.system.trace("limited", {"s": values}, {"u": u, "v": v})
 
     def of_motion(self, motion: PinnedMotion) -> FloatArray:
         """The rows of s along a motion with pinned outputs."""
         rows = motion.states, motion.controls, motion.constraint_inputs, motion.parameters
-        return np.array([self.pinned_values(*row)[0] for row in zip(*rows, strict=True)])
+        return np.array([self.pinned(*row)[0] for row in zip(*rows, strict=True)])
 
     def of_record(self, record: Record) -> FloatArray:
         """The rows of s in a record of the system."""
         signals = (record["state"], record["control"], record["constraint_force"])
         p = self.system.parameter_values
-        rows = [self._values(*row, p)[0] for row in zip(*signals, strict=True)]
+        rows = [self._recorded(*row, p)[0] for row in zip(*signals, strict=True)]
         return np.array(rows).reshape(len(rows), len(self.signals))
 
     def ranges(self, times: FloatArray, values: FloatArray) -> tuple[SignalRange, ...]:
@@ -208,21 +216,11 @@ def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> Signa
 
 @dataclass(frozen=True)
 class LimitsAlong:
-    """The largest excess along references r(t), and the remedy.
-
-    r(c t) keep all limits with `rate`, the largest such c below 1; if None, `reason` says why.
-    """
+    """The largest excess along references r(t), and the remedy: r(c t) with c = `rate`, or none."""
 
     excess: Excess
     rate: float | None
-    reason: str = ""
-
-    @property
-    def remedy(self) -> str:
-        """What to do, as a phrase."""
-        if self.rate is None:
-            return self.reason
-        return f"all references must be {1.0 / self.rate:.4g} times slower to keep the limits"
+    remedy: str
 
 
 def limits_along(
@@ -243,30 +241,21 @@ def limits_along(
         return None
     if system.exogenous.moving or structure.zero_dynamics_dimension:
         free = "exogenous signals" if system.exogenous.moving else "the zero dynamics"
-        return LimitsAlong(
-            excess, None, f"not decided for slower references: {free} keep their pace"
-        )
+        text = f"not decided for slower references: {free} keep their pace"
+        return LimitsAlong(excess, None, text)
     pinned, goals = PinnedOutputs(structure), np.array([reference(float(time)) for time in times])
     powers = np.concatenate([np.arange(degree + 1) for degree in layout.reference_degrees])
-    commanded = layout.lowest[[j for j in range(system.num_outputs) if system.m[j, :].nnz()]]
-
-    def slowed(i: int, rate: float, force: float = 1.0) -> FloatArray:
-        goal = goals[i] * rate**powers
-        goal[commanded] *= force
-        at = PinnedSet(pinned, goal, p[i])
-        point = at.point(at.state(motion.states[i]))
-        values = limits.pinned_values(point.state, point.control, point.constraint_input, p[i])
-        return values[0]
 
     def worst(rate: float, chosen: Sequence[int] = range(times.size)) -> Excess | None:
-        return limits.worst(times[list(chosen)], np.array([slowed(i, rate) for i in chosen]))
+        rows = []
+        for i in chosen:
+            at = PinnedSet(pinned, goals[i] * rate**powers, p[i])
+            point = at.point(at.state(motion.states[i]))
+            rows.append(limits.pinned(point.state, point.control, point.constraint_input, p[i])[0])
+        return limits.worst(times[list(chosen)], np.array(rows))
 
     if (rest := worst(0.0)) is not None:
-        i, column = int(np.searchsorted(times, rest.time)), limits.signals.index(rest.signal)
-        alone = slowed(i, 0.0, force=0.0)[column]
-        alone *= abs(alone) > SLACK * abs(rest.value)  # Else round-off.
-        text = f"slower references do not help: at rest {rest}; by gravity alone it has {alone:.4g}"
-        return LimitsAlong(excess, None, f"{text} {rest.signal.unit}".rstrip())
+        return LimitsAlong(excess, None, f"slower references do not help: at rest {rest}")
     rate, now = 1.0, worst(1.0)
     while now is not None:
         i, low, high = int(np.searchsorted(times, now.time)), 0.0, rate
@@ -274,4 +263,5 @@ def limits_along(
             middle = 0.5 * (low + high)
             low, high = (middle, high) if worst(middle, [i]) is None else (low, middle)
         rate, now = low, worst(low)
-    return LimitsAlong(excess, rate)
+    text = f"all references must be {1.0 / rate:.4g} times slower to keep the limits"
+    return LimitsAlong(excess, rate, text)

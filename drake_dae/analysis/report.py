@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.analysis.tables import Part, Table, count_of, named_values, to_markdown, to_text
+from drake_dae.analysis.tables import Part, Table, count_of, named_values, to_text
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import (
@@ -197,21 +197,15 @@ class Analysis:
     def __str__(self) -> str:
         return to_text([*self.parts(), *([problem] for problem in self.problems)])
 
-    def to_markdown(self) -> str:
-        """Returns the report with Markdown tables."""
-        return to_markdown([*self.parts(), *([problem] for problem in self.problems)])
-
     def parts(self) -> list[Part]:
         """Returns the paragraphs and tables of the report, without the problems."""
         return [*_parts(self)]
-
-    def _repr_markdown_(self) -> str:
-        return self.to_markdown()
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the report as plain numbers, lists and texts."""
         system, motion, order = self.system, self.motion, self.output_order
         zero, along, sharing = self.zero_dynamics, self.zero_dynamics_along, system.sharing
+        rows, outputs = system.constraint_output_signals, system.output_signals
         return {
             "name": system.name,
             "num_states": system.num_states,
@@ -220,9 +214,7 @@ class Analysis:
             "num_outputs": system.num_outputs,
             "states": [signal.name for signal in system.state_signals],
             "examined_at": self.where,
-            "constraint_degrees": _by_name(
-                system.constraint_output_signals, self.constraint_degrees
-            ),
+            "constraint_degrees": _by_name(rows, self.constraint_degrees),
             "index": self.index,
             "manifold_dimension": self.manifold_dimension,
             "redundant": sharing
@@ -230,15 +222,20 @@ class Analysis:
                 "left_out": [signal.name for signal in sharing.left_out_signals],
                 "undetermined_forces": list(sharing.undetermined),
             },
-            "output_degrees": _by_name(system.output_signals, self.output_degrees),
-            "output_order": order and [system.output_signals[i].name for i in order],
+            "output_degrees": _by_name(outputs, self.output_degrees),
+            "output_order": order and [outputs[i].name for i in order],
             "zero_dynamics_dimension": self.zero_dynamics_dimension,
             "assumptions": [
                 {
                     "number": a.number,
                     "statement": a.statement,
                     "finding": str(a.finding),
-                    "margin": _margin(a.margin),
+                    "margin": a.margin
+                    and {
+                        "singular_value": float(a.margin.singular_value),
+                        "relative": float(a.margin.relative),
+                        "state": a.margin.state.tolist(),
+                    },
                     "reason": a.reason,
                 }
                 for a in self.assumptions
@@ -269,31 +266,18 @@ class Analysis:
 
 
 def _by_name(signals: Sequence[Signal], values: Sequence[int] | None) -> dict[str, int] | None:
-    if values is None:
-        return None
-    return {signal.name: value for signal, value in zip(signals, values, strict=True)}
-
-
-def _margin(margin: RankMargin | None) -> dict[str, Any] | None:
-    if margin is None:
-        return None
-    return {
-        "singular_value": float(margin.singular_value),
-        "relative": float(margin.relative),
-        "state": margin.state.tolist(),
-    }
+    names = [signal.name for signal in signals]
+    return None if values is None else dict(zip(names, values, strict=True))
 
 
 def _friction(margin: ContactMargin | None) -> dict[str, Any] | None:
     """The distance from the Painleve paradox; a coefficient without a critical value is None."""
     if margin is None:
         return None
+    critical = margin.critical_friction.items()
     return {
         "reserve": margin.reserve,
-        "critical_friction": {
-            name: value if np.isfinite(value) else None
-            for name, value in margin.critical_friction.items()
-        },
+        "critical_friction": {n: value if np.isfinite(value) else None for n, value in critical},
         "state": margin.state.tolist(),
         "time": margin.time,
     }
@@ -309,7 +293,7 @@ def _stability(stability: Stability) -> dict[str, Any]:
 
 def _pairs(values: ComplexArray) -> list[list[float]]:
     """Complex numbers as their real and imaginary parts."""
-    return [[float(value.real), float(value.imag)] for value in values]
+    return np.stack([values.real, values.imag], axis=-1).tolist()
 
 
 def _parts(found: Analysis) -> Iterator[Part]:

@@ -1,4 +1,4 @@
-"""Tables and paragraphs as plain text and as Markdown."""
+"""Tables and paragraphs as plain text."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,24 +19,17 @@ class Table:
     rows: Sequence[Sequence[str]]
     left: int = 1
 
-    def _is_left(self, column: int) -> bool:
-        return column < self.left or not self.head[column]
-
     def __str__(self) -> str:
         rows = [self.head, *self.rows]
         widths = [max(len(row[i]) for row in rows) for i in range(len(self.head))]
         lines = []
         for row in rows:
-            cells = enumerate(zip(row, widths, strict=True))
-            aligned = [t.ljust(w) if self._is_left(i) else t.rjust(w) for i, (t, w) in cells]
+            cells = enumerate(zip(row, widths, self.head, strict=True))
+            aligned = [
+                t.ljust(w) if i < self.left or not h else t.rjust(w) for i, (t, w, h) in cells
+            ]
             lines.append("  ".join(aligned).rstrip())
         return "\n".join(lines)
-
-    def to_markdown(self) -> str:
-        """Returns the table in Markdown, for notebooks and GitHub."""
-        marks = [":--" if self._is_left(i) else "--:" for i in range(len(self.head))]
-        rows = [self.head, marks, *self.rows]
-        return "\n".join("| " + " | ".join(t.replace("|", "\\|") for t in r) + " |" for r in rows)
 
 
 def digits(value: float) -> str:
@@ -59,13 +52,6 @@ def to_text(parts: Sequence[Part]) -> str:
         )
 
     return "\n\n".join(map(text, parts))
-
-
-def to_markdown(parts: Sequence[Part]) -> str:
-    """Joins parts to Markdown."""
-    return "\n\n".join(
-        part.to_markdown() if isinstance(part, Table) else "  \n".join(part) for part in parts
-    )
 
 
 def count_of(number: int, noun: str) -> str:

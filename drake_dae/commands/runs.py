@@ -143,7 +143,7 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
                     from drake_dae.pictures.plots import save_plots  # Matplotlib takes a second.
 
                     with attempt(PLOTS[0]) as file:
-                        save_plots(loop, record, context, file.parent, summary.accuracy)
+                        save_plots(loop, record, context, file.parent)
                 if wanted.animation and not isinstance(ended, KeyboardInterrupt):
                     title = f"{path.stem}: {scenario.description}".removesuffix(": ")
                     with attempt(ANIMATION) as file:

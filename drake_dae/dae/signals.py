@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, check_writable, numbers, unknown_name
+from drake_dae.arrays import FloatArray, brief, numbers, unknown_name
 from drake_dae.errors import ModelError
 
 Indices = np.typing.NDArray[np.intp]
@@ -34,9 +34,6 @@ class Signal:
 
     name: str
     unit: str = ""
-
-    def __post_init__(self) -> None:
-        check_writable("the name of a signal", self.name)
 
     def derivative(self, order: int) -> "Signal":
         """Returns the signal of a time derivative: x -> x', x'', ..., with the matching unit."""

@@ -180,11 +180,7 @@ def _hex(color: Rgba) -> str:
 
 
 def _draw_tube(meshcat: Meshcat, path: str, points: FloatArray, color: Rgba, radius: float) -> None:
-    """Draws a thin tube around a line through points, m, shape (k, 3).
-
-    Its vertices are rings around the points, and its triangles segment after segment, so that the
-    page can draw it up to a time.
-    """
+    """Draws a tube along points, m, (k, 3), in segments: the page draws it up to a time."""
     if len(points) < 2:
         return
     tangent = np.gradient(points, axis=0)

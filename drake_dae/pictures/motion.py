@@ -20,25 +20,21 @@ from drake_dae.scene.view import FRAME_RATE
 # A path on a surface is omitted if its extent is below this fraction of the largest coordinate of
 # all contact points.
 _STILL = 1e-4
-_EXTENT_STATES = 60  # The approximate number of states from which the extent of a run is computed.
 
 
 @dataclass(frozen=True, eq=False)
 class RunMotion:
-    """The motion of a robot in a run, at k frames, whose times in s begin at 0.
-
-    States have shape (k, n), the values of all parameters a row each. `desired` are link states at
-    rest (q, 0) with the desired outputs, until these are out of reach, shape (j, nq + nv), j <= k.
-    `acting` gives the constraint wrenches, for the parameters at the start.
-    """
+    """The motion of a robot in a run, at k frames, whose times in s begin at 0."""
 
     model: RobotModel
     times: FloatArray
     start_time: float
-    states: FloatArray
-    parameters: FloatArray
+    states: FloatArray  # (k, n)
+    parameters: FloatArray  # all, a row for each frame
     wrenches: Sequence[Wrenches]
-    desired: FloatArray
+    desired: (
+        FloatArray  # link states at rest with the desired outputs, until these are out of reach
+    )
     acting: ConstraintWrenches
 
     @property
@@ -56,28 +52,32 @@ class RunMotion:
 
     @property
     def normals(self) -> FloatArray:
-        """Unit normals of surfaces, zero without one, (k, constraints, 3): of forces at rest."""
-        nq, nv = self.model.links.q.numel(), self.model.links.v.numel()
-        force = np.array([one for c in self.model.constraints for one in c.is_unilateral], float)
-        at_rest = np.pad(self.states[:, :nq], ((0, 0), (0, nv)))
-        pairs = zip(at_rest, self.parameters, strict=True)
-        normals = np.array([self.acting(state, force, values).forces for state, values in pairs])
-        lengths = np.linalg.norm(normals, axis=2, keepdims=True)
-        return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+        """Unit normals of surfaces, zero without one, (k, constraints, 3)."""
+        pairs = zip(self.states, self.parameters, strict=True)
+        return np.array([surface_normals(self.model, self.acting, *pair) for pair in pairs])
+
+
+def surface_normals(
+    model: RobotModel, acting: ConstraintWrenches, state: FloatArray, parameters: FloatArray
+) -> FloatArray:
+    """Unit normals of surfaces at a state, zero without one, (constraints, 3): forces at rest."""
+    nq, nv = model.links.q.numel(), model.links.v.numel()
+    force = np.array([one for c in model.constraints for one in c.is_unilateral], float)
+    normals = acting(np.pad(state[:nq], (0, nv)), force, parameters).forces
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class ContactPath:
-    """The path of a contact point on a surface, in the plane normal to the surface's mean normal.
-
-    Actual and desired coordinates are in m, shapes (k, 2) and (j, 2). `points_left` tells whether
-    who looks from the free side, with the second axis up, sees the first axis to the left.
-    """
+    """The path of a contact point on a surface, in the plane across the surface's mean normal."""
 
     name: str
-    actual: FloatArray
-    desired: FloatArray
-    points_left: bool = False
+    actual: FloatArray  # m, (k, 2)
+    desired: FloatArray  # m, (j, 2)
+    points_left: bool = (
+        False  # Whether the first axis does, with the second up, from the free side.
+    )
 
 
 def follow(
@@ -150,7 +150,7 @@ def contact_paths(motion: RunMotion) -> list[ContactPath]:
 
 def run_points(motion: RunMotion, scene_graph: SceneGraph | None) -> FloatArray:
     """Points that enclose the robot and its paths over the run, m, shape (k, 3)."""
-    states = motion.states[:: max(1, len(motion.states) // _EXTENT_STATES)]
+    states = motion.states[:: max(1, len(motion.states) // 60)]  # They are enough.
     paths = [motion.points.reshape(-1, 3), motion.desired_points.reshape(-1, 3)]
     return np.vstack([scene_points(motion.model, motion.acting, states, scene_graph), *paths])
 
@@ -161,10 +161,7 @@ def run_view(
     view: tuple[float, float, float],
     arrow: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """The position of a camera that shows a whole run, and a point on its axis, m.
-
-    `view` is that of `view_angles`, and `arrow` the length of the longest arrow of a force, in m.
-    """
+    """A camera that shows a whole run, and a point on its axis, m; `arrow` is the longest one."""
     forces = np.array([wrench.forces for wrench in motion.wrenches])
     largest = np.max(np.linalg.norm(forces, axis=2), initial=1e-6)
     tails = (motion.points - arrow * forces / largest).reshape(-1, 3)

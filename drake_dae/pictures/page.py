@@ -25,6 +25,7 @@ from drake_dae.blocks.compose import compose
 from drake_dae.dae import DaeSystem
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import MachineCodeError, ModelError
+from drake_dae.pictures.motion import surface_normals
 from drake_dae.pictures.page_controls import (
     Numbers,
     controls_of,
@@ -146,7 +147,7 @@ def as_script(data: Any) -> str:
         text = json.dumps(data, allow_nan=False)
     except ValueError:
         raise ModelError("a page needs finite numbers") from None
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    return text.replace("<", "\\u003c")
 
 
 class Bench:
@@ -258,11 +259,7 @@ class RobotScene:
         self.targets = [each for each in model.outputs if isinstance(each, PointCoordinates)]
 
     def columns(self, state: ca.SX, force: ca.SX, parameters: ca.SX) -> ca.SX:
-        """Numbers in the world, as one column of expressions.
-
-        12 for each body, R by columns and p; points of application, forces and moments of
-        all constraints; 12 for each surface; the point of each target.
-        """
+        """Poses of bodies, R by columns and p; wrenches; poses of surfaces; targets: one column."""
         model, links = self.model, self.model.links
         symbols = [ca.vertcat(links.q, links.v), ca.SX.sym("force", model.dae.num_constraints)]
         symbols.append(model.dae.parameter_symbol)
@@ -282,6 +279,7 @@ class RobotScene:
     def data(self, state: FloatArray, slider: Callable[[str, str], int | None]) -> dict[str, Any]:
         """What the browser knows of these parts; `slider` gives the index of a slider."""
         model, acting = self.model, list(self.wrenches.constraints)
+        normals = surface_normals(model, self.wrenches, state, model.dae.parameter_values)
         names = [signal.name for signal in self.plant.dae.output_signals]
         constraints = [
             {
@@ -294,13 +292,13 @@ class RobotScene:
         surfaces = []
         for surface in self.surfaces:
             position = next(p for p in surface.parameters if p.name == f"{surface.name}.position")
-            direction = self._normal(surface, state).tolist() if surface in acting else None
+            normal = normals[acting.index(surface)] if surface in acting else np.zeros(3)
             surfaces.append(
                 {
                     "name": surface.name,
                     "path": _path(surface, "surface"),
                     "controls": [slider("surface", s.name) for s in position.signals],
-                    "direction": direction,
+                    "direction": normal.tolist() if normal.any() else None,
                 }
             )
         targets = []
@@ -315,22 +313,12 @@ class RobotScene:
                     "outputs": [[axis, names.index(name)] for axis, name in axes],
                 }
             )
-        bodies = [{"name": name, "path": path} for name, path, _ in self.bodies]
         return {
-            "bodies": bodies,
+            "bodies": [{"name": name, "path": path} for name, path, _ in self.bodies],
             "constraints": constraints,
             "surfaces": surfaces,
             "targets": targets,
         }
-
-    def _normal(self, surface: Constraint, state: FloatArray) -> FloatArray:
-        """The unit normal of a surface at its contact point: of the force at rest."""
-        model = self.model
-        rest = np.concatenate([state[: model.links.q.numel()], np.zeros(model.links.v.numel())])
-        multipliers = np.ones(sum(len(c.force_signals) for c in model.constraints))
-        row = list(self.wrenches.constraints).index(surface)
-        force = self.wrenches(rest, multipliers).forces[row]
-        return np.asarray(force / np.linalg.norm(force))
 
 
 def meshcat_page(robot: RobotScene, state: FloatArray, scene_graph: SceneGraph | None) -> str:
@@ -373,22 +361,21 @@ def _path(constraint: Constraint, part: str) -> list[str]:
 # ------------------------------------------------------------------ long functions in pieces
 
 # The largest number of assignments in a function. For 60,000 assignments, clang needs 180 s of CPU
-# in one function, and 9 s in pieces of 2,000, whose code is 40 % larger.
+# in one function, and seconds in pieces of 2,000.
 LONGEST = 2000
 
-_NAME = re.compile(r"\ba\d+\b")
+_NAME = re.compile(r"\ba0*(\d+)\b")
 _FUNCTION = re.compile(
     r"(?P<head>static int (?P<name>casadi_f\d+)\([^\n]*\{)\n(?P<body>(?:  [^\n]*\n)*)\}"
 )
 _DECLARATION = "  casadi_real a"
 _ARGUMENTS = (
-    "const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, "
-    "casadi_real* shared"
+    "const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, casadi_real* a"
 )
 
 
 def in_pieces(source: str, longest: int = LONGEST) -> str:
-    """Splits long functions of C into pieces that pass values on by the array `shared`."""
+    """Splits long functions of C into pieces, for which all variables are entries of one array."""
     return _FUNCTION.sub(lambda function: _split(function, longest), source)
 
 
@@ -400,35 +387,11 @@ def _split(function: re.Match[str], longest: int) -> str:
     ]
     if len(rows) <= longest:
         return function[0]
-    pieces = [rows[i : i + longest] for i in range(0, len(rows), longest)]
-    uses = [_uses(piece) for piece in pieces]
-    # needed[k]: the variables that piece k or a later one reads before a new assignment.
-    needed = [set[str]()]
-    for read, assigned in reversed(uses):
-        needed.insert(0, read | (needed[0] - assigned))
-    index = {variable: i for i, variable in enumerate(sorted(set().union(*needed)))}
-    name, text, calls = function["name"], "", ""
-    for k, (piece, (read, assigned)) in enumerate(zip(pieces, uses, strict=True)):
-        begin = [
-            f"  casadi_real {a}{f' = shared[{index[a]}]' if a in read else ''};"
-            for a in sorted(read | assigned)
-        ]
-        end = [f"  shared[{index[a]}] = {a};" for a in sorted(assigned & needed[k + 1])]
+    size = 1 + max(map(int, _NAME.findall(function["body"])))
+    name, text, calls = function["name"], "", f"  casadi_real a[{size}];\n"
+    for k, i in enumerate(range(0, len(rows), longest)):
+        piece = (_NAME.sub(r"a[\1]", row) for row in rows[i : i + longest])
         head = f"static int __attribute__((noinline)) {name}_{k}({_ARGUMENTS}) {{"
-        text += "\n".join([head, *begin, *piece, *end, "  return 0;", "}", "", ""])
-        calls += f"  if ({name}_{k}(arg, res, iw, w, shared)) return 1;\n"
-    shared = f"  casadi_real shared[{len(index) + 1}];\n"
-    return f"{text}{function['head']}\n{shared}{calls}  return 0;\n}}"
-
-
-def _uses(rows: Sequence[str]) -> tuple[set[str], set[str]]:
-    """Returns the variables that rows read before they assign them, and those that they assign."""
-    read, assigned = set[str](), set[str]()
-    for row in rows:
-        target, _, value = row.partition("=")
-        variable = target.strip()
-        is_assignment = _NAME.fullmatch(variable)  # Otherwise it is a result, or a condition.
-        read |= set(_NAME.findall(value if is_assignment else row)) - assigned
-        if is_assignment:
-            assigned.add(variable)
-    return read, assigned
+        text += "\n".join([head, *piece, "  return 0;", "}", "", ""])
+        calls += f"  if ({name}_{k}(arg, res, iw, w, a)) return 1;\n"
+    return f"{text}{function['head']}\n{calls}  return 0;\n}}"

@@ -9,9 +9,8 @@ from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
 from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import Signal, poles
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import GainError
 from drake_dae.systems.controller import SIGNAL, Controller
 from drake_dae.systems.plant import Plant
 from drake_dae.systems.references import CommandedReferences
@@ -24,25 +23,19 @@ _ORDER = ("N", "m")  # The units of the first sliders of references; all others 
 
 @dataclass(frozen=True)
 class Control:
-    """A slider, or an object that a person drags, and the places of the parameters that it sets.
+    """A slider, or an object that a person drags, and the places of the parameters that it sets."""
 
-    Its kind is "reference", "surface", "signal", "plant" or "pole". `known` are the places of the
-    same parameters in the law's model, which it sets, too, if the person so chooses. One for poles
-    sets parameter i to `factors[i] * |value| ** powers[i]`. `rate` is the largest rate of change
-    per s, 0 for no limit.
-    """
-
-    kind: str
+    kind: str  # "reference", "surface", "signal", "plant" or "pole"
     label: str
     unit: str
     low: float
     high: float
     value: float
     inputs: tuple[int, ...]
-    known: tuple[int, ...] = ()
-    factors: tuple[float, ...] = ()
+    known: tuple[int, ...] = ()  # The same parameters of the law's model, if the person so chooses.
+    factors: tuple[float, ...] = ()  # Of poles: parameter i is factors[i] * |value| ** powers[i].
     powers: tuple[int, ...] = ()
-    rate: float = 0.0
+    rate: float = 0.0  # the largest rate of change per s; 0: no limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +44,8 @@ class Numbers:
 
     signals: Sequence[Signal]
     values: FloatArray
-    systems: Mapping[System, slice]
-    """System -> the place of its parameters."""
-    inputs: Mapping[str, slice]
-    """Name of a free input port -> the place of its value."""
+    systems: Mapping[System, slice]  # System -> the place of its parameters.
+    inputs: Mapping[str, slice]  # Name of a free input port -> the place of its value.
 
     def of(self, system: Any) -> dict[str, int]:
         """Name of a parameter of a block -> its place."""
@@ -123,11 +114,9 @@ def _commands(loop: ClosedLoop, numbers: Numbers, time: float, size: float) -> l
 
 
 def _surfaces(loop: ClosedLoop, numbers: Numbers, reach: float) -> list[Control]:
-    """Sliders for the positions of surfaces.
-
-    Those that move do so in the plant and in the law. Those of a compliant contact are parameters
-    of the plant and not of the law, and change in steps, which the limited rate makes small.
-    """
+    """Sliders for the positions of surfaces."""
+    # Those that move do so in the plant and in the law. Those of a compliant contact are parameters
+    # of the plant and not of the law, and change in steps, which the limited rate makes small.
     places, plant = dict[str, list[int]](), loop.plant
     for generator in dict.fromkeys((loop.plant_exogenous, loop.exogenous)):
         if isinstance(generator, CommandedReferences):
@@ -150,25 +139,23 @@ def _surfaces(loop: ClosedLoop, numbers: Numbers, reach: float) -> list[Control]
 
 
 def _control_of_pole(controller: Controller, numbers: Numbers) -> list[Control]:
-    """A slider for the pole of all errors; none if the gains do not have a single pole."""
-    law, part = controller.law, numbers.systems.get(controller)
-    if not controller.follows or part is None:
+    """A slider that moves all poles of the errors in proportion: their mean."""
+    gains, part = controller.law.gains, numbers.systems.get(controller)
+    layout = gains.layout
+    if not controller.follows or part is None or not layout.chain_size:
         return []
-    size = law.system.parameter_symbol.numel()
-    try:
-        gains = {p: law.all_parameters(None, poles(-p))[size:] for p in (1.0, 2.0, 3.0)}
-    except GainError:
-        return []
-    factors, first = gains[1.0], part.start + size
-    indices = list(range(first, first + factors.size))
-    powers = np.round(np.log2(np.where(factors, gains[2.0] / np.where(factors, factors, 1.0), 1.0)))
-    if not indices or not np.allclose(factors * 3.0**powers, gains[3.0], rtol=1e-9):
-        return []
-    # The mean of all poles, since the computed eigenvalues of a multiple pole are not exact.
-    pole = -float(np.trace(law.gains.error_matrix)) / law.gains.layout.chain_size
-    if not np.allclose(numbers.values[indices], factors * pole**powers, rtol=1e-9):
-        return []
-    sets = tuple(indices), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
+    first = part.start + controller.law.system.parameter_symbol.numel()
+    starts = {int(i): int(layout.starts[i]) for i in layout.dynamic}
+    lengths = {i: end - starts[i] + 1 for i, end in zip(starts, layout.ends.tolist(), strict=True)}
+    # Of (30) in the time s t, the gain from derivative k to one of order n is s^(n - k) as large.
+    powers = [
+        lengths[i] - j + max(start for start in starts.values() if start <= j)
+        for j, i in np.argwhere(gains.matrix.T).tolist()
+    ]
+    places = range(first, first + len(powers))
+    pole = -float(np.trace(gains.error_matrix)) / layout.chain_size
+    factors = numbers.values[places] / pole ** np.array(powers)
+    sets = tuple(places), (), tuple(factors.tolist()), tuple(powers)
     fastest = rounded(max(4.0 * pole, 20.0))
     return [Control("pole", "pole of all errors", "1/s", -fastest, -0.5, -pole, *sets)]
 
@@ -176,12 +163,9 @@ def _control_of_pole(controller: Controller, numbers: Numbers) -> list[Control]:
 def strongest_pushes(
     plant: Plant, state: FloatArray, links: Sequence[str], rate: float
 ) -> dict[str, float]:
-    """Link -> the force of the strongest push on it, in N.
-
-    A law with poles at -p acts on a mass m like a spring of stiffness m p^2, and the effective mass
-    at the link's origin, where it is smallest, is 1 / (J M^-1 J^T). So a force m p^2 d moves the
-    link by d; `rate` is p^2 d.
-    """
+    """Link -> the force of the strongest push on it, in N; `rate` is p^2 d."""
+    # A law with poles at -p acts on a mass m like a spring of stiffness m p^2, and the mass at the
+    # link's origin is 1 / (J M^-1 J^T). So a force m p^2 d moves the link by d.
     robot, forces = plant.robot("a page").links.plant, dict[str, float]()
     if robot is None:
         return forces

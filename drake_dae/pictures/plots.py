@@ -19,7 +19,6 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, Recorded, phase_spans
 from drake_dae.errors import ModelError
 from drake_dae.pictures.motion import ContactPath, contact_paths, follow
-from drake_dae.running.judgement import output_sizes
 
 # The signals in which an entry's name is looked up first; of these the first has the outputs.
 _FIRST = ("controlled_output", "constraint_force", "control", "state")
@@ -28,8 +27,6 @@ _DERIVED = ("desired_output", "tracking_error", "predicted_error")
 _PHASE = 0.11  # The width of a phase's name, which is vertical, in inches.
 # The style of predicted errors and desired paths, below the narrow actual ones.
 _WIDE: dict[str, Any] = {"linewidth": 4, "alpha": 0.4}
-
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 Entry = tuple[str, int]  # The name of a record's signal, and the index of an entry in it.
 
@@ -81,12 +78,10 @@ def plot_runs(
     return _draw(records, entries, errors)
 
 
-def save_plots(
-    loop: ClosedLoop, record: Record, context: Context, folder: Path, accuracy: float | None = None
-) -> None:
+def save_plots(loop: ClosedLoop, record: Record, context: Context, folder: Path) -> None:
     """Writes the plots of a run of a loop of a robot as PNG files, `PLOTS`."""
     motion, predicted = follow(loop, record, context), loop.predicted_error(record)
-    figures = figures_of_run(record, predicted, motion.model.control_limits, accuracy)
+    figures = figures_of_run(record, predicted, motion.model.control_limits)
     if paths := contact_paths(motion):
         figures["path.png"] = plot_paths(paths)
     folder.mkdir(parents=True, exist_ok=True)
@@ -95,24 +90,18 @@ def save_plots(
 
 
 def figures_of_run(
-    record: Record,
-    predicted: FloatArray,
-    limits: FloatArray | None = None,
-    accuracy: float | None = None,
+    record: Record, predicted: FloatArray, limits: FloatArray | None = None
 ) -> dict[str, Figure]:
     """Name of a file -> its figure: outputs, errors, residual and controls of one run.
 
-    `limits` are the largest |u|, shape (p,), inf for an actuator without one. Errors below the
-    accuracy of the integrator are grey.
+    `limits` are the largest |u|, shape (p,), inf for an actuator without one.
     """
     outputs = record.signals["controlled_output"].signals
     signals = {**record.signals, "predicted_error": Recorded(predicted, outputs)}
-    run = {"actual": replace(record, signals=signals)}
-    accurate_to = None if accuracy is None else accuracy * output_sizes(record, predicted)
-    figures = {}
+    run, figures = {"actual": replace(record, signals=signals)}, {}
     if entries := _entries(record, "controlled_output"):
         figures["outputs.png"] = _draw(run, entries, False)
-        figures["errors.png"] = _draw(run, entries, True, accurate_to=accurate_to)
+        figures["errors.png"] = _draw(run, entries, True)
     figures["residual.png"] = _plot_residual(record)
     if entries := _entries(record, "control"):
         figures["controls.png"] = _draw(run, entries, False, limits)
@@ -181,7 +170,6 @@ def _draw(
     entries: Sequence[Entry],
     errors: bool,
     limits: FloatArray | None = None,
-    accurate_to: FloatArray | None = None,
 ) -> Figure:
     """Entries of signals over time, one axes each: their values, or errors over predicted ones."""
     first = next(iter(records.values()))
@@ -216,9 +204,6 @@ def _draw(
         style: dict[str, Any] = {"color": own_color or "0.5"}
         if errors:
             axis.plot([], [], label="predicted", **style, **_WIDE)
-            if accurate_to is not None:
-                label, top = "below the integrator's accuracy", float(accurate_to[at])
-                axis.axhspan(min(floors) / 3.0, top, color="0.88", zorder=0.5, label=label)
             _set_decades(axis, min(floors))
             continue
         if group == _FIRST[0]:
@@ -280,16 +265,10 @@ def _mark(figure: Figure, record: Record) -> None:
 
 
 def _set_decades(axis: Axes, floor: float) -> None:
-    """Sets the range of a logarithmic axis, from a third of `floor` upward, and a few tick labels.
-
-    The labels are plain text: Matplotlib draws its mathematical labels slower than the curves.
-    """
-    low, high = floor / 3.0, max(axis.get_ylim()[1], 1e4 * floor)
-    axis.set_ylim(low, high)
-    first, last = int(np.ceil(np.log10(low))), int(np.floor(np.log10(high)))
-    powers = range(first, last + 1, max(1, -(-(last - first) // 5)))
-    axis.set_yticks([10.0**k for k in powers], [f"10{str(k).translate(_RAISED)}" for k in powers])
-    axis.set_yticks([], minor=True)
+    """Sets the range of a logarithmic axis, from a third of `floor` upward, with plain labels."""
+    axis.set_ylim(floor / 3.0, max(axis.get_ylim()[1], 1e4 * floor))
+    axis.yaxis.set_major_formatter("{x:.0e}")
+    axis.minorticks_off()
 
 
 def _flatten(axis: Axes, values: FloatArray) -> None:

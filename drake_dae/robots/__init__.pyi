@@ -61,8 +61,6 @@ from .plant_frames import frame_name as frame_name
 from .plant_frames import frame_named as frame_named
 from .plant_frames import joint_names as joint_names
 from .plant_frames import unique_names as unique_names
-from .rolling import Blade as Blade
-from .rolling import RollingBall as RollingBall
 from .rolling import RollingWheel as RollingWheel
 from .shapes import Cylinder as Cylinder
 from .shapes import Ellipsoid as Ellipsoid
@@ -70,6 +68,8 @@ from .shapes import ImplicitSurface as ImplicitSurface
 from .shapes import Plane as Plane
 from .shapes import Sphere as Sphere
 from .shapes import Torus as Torus
+from .surface import LETTERS as LETTERS
+from .surface import Letter as Letter
 from .surface import Pair as Pair
 from .surface import PosedShape as PosedShape
 from .surface import Surface as Surface

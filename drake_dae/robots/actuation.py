@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers
+from drake_dae.arrays import FloatArray, each, numbers
 from drake_dae.dae import Parameter, Signal, as_expression, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.links import Links
@@ -81,13 +81,11 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
         rigid = ca.SX(p, 1), ca.SX.eye(p), ca.SX(0, 0), none, ca.SX(0, p)
         return ActuationChain((), *rigid, tuple(links.actuator_signals), none)
     names = [type(stage).__name__ for stage in stages]
-    if not p:
-        raise ModelError(f"{names[0]} needs actuators of the links, and there are none")
     select = links.actuation_matrix
-    if not np.allclose(select.T @ select, np.eye(p)):
+    if not p or not np.allclose(select.T @ select, np.eye(p)):
         raise ModelError(
-            "actuation stages need one actuator per actuated joint, so orthonormal columns of the "
-            "actuation matrix"
+            f"{names[0]} needs one actuator per actuated joint, so orthonormal columns of the "
+            f"actuation matrix; there are {p} actuators"
         )
     transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
     if not ca.is_equal(ca.sparsify(ca.mtimes(transposed, links.velocity_map)), transposed, 9):
@@ -96,12 +94,6 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
             "q_i' = v_i: choose such coordinates where N(q) is not the identity"
         )
     attached = [stage.attach(links) for stage in stages]
-    carriers = [n for n, stage in zip(names, attached, strict=True) if stage.carries_rotors]
-    if len(carriers) > 1:
-        raise ModelError(
-            f"the rotors would turn with each of {', '.join(carriers)}, but stages that carry them "
-            "come once in a chain; put all springs into one"
-        )
     loads = [(ca.mtimes(transposed, links.q), ca.mtimes(transposed, links.v))]
     for name, other, before in zip(names[1:], names, attached, strict=False):
         if before.shaft is None:
@@ -127,9 +119,9 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
 def full_matrix(name: str, value: ArrayLike, size: int) -> FloatArray:
     """A finite number, a diagonal or a matrix, as a matrix of shape (size, size)."""
     array = numbers(name, value)
-    if array.ndim < 2 and array.shape in ((), (size,)):
-        array = np.diag(np.broadcast_to(array, (size,)))
-    if array.shape != (size, size) or not np.all(np.isfinite(array)):
+    if array.shape in ((), (size,)):
+        return np.diag(np.broadcast_to(array, (size,)))
+    if array.shape != (size, size):
         raise ModelError(
             f"{name} must be a finite number, shape ({size},) or ({size}, {size}), got {value!r}"
         )
@@ -145,11 +137,7 @@ def diagonal_parameter(
     nonnegative: bool = False,
 ) -> tuple[Parameter, ca.SX]:
     """A parameter of one number per actuator, and its symbol, shape (size, 1)."""
-    array = numbers(name, value)
-    if array.shape not in ((), (size,)) or not np.all(np.isfinite(array)):
-        raise ModelError(f"{name} must be a finite number or shape ({size},), got {value!r}")
-    values = np.broadcast_to(array, (size,)).copy()
-    parameter = Parameter(name, values, unit, positive, nonnegative=nonnegative)
+    parameter = Parameter(name, each(name, value, size), unit, positive, nonnegative=nonnegative)
     return parameter, parameter.symbol
 
 
@@ -221,14 +209,8 @@ class FlexibleJoints(Stage):
         stiffness, k = matrix_parameter("flexible_joints.stiffness", self.stiffness, p, units[0])
         rotors, m_2 = matrix_parameter("flexible_joints.inertia", inertia, p, units[1])
         parameters, d, name = [stiffness, rotors], ca.SX(p, p), "flexible_joints.damping"
-        if np.any(full_matrix(name, self.damping, p)):
-            try:
-                damping, d = matrix_parameter(name, self.damping, p, units[2])
-            except ModelError as error:
-                raise ModelError(
-                    f"{error}. Damp all flexible joints or none: where only some are damped, the "
-                    "control reaches the outputs at different orders"
-                ) from None
+        if np.any(self.damping):
+            damping, d = matrix_parameter(name, self.damping, p, units[2])
             parameters.append(damping)
         q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
         drag = ca.SX(p, 1)
@@ -294,10 +276,10 @@ class DcMotors(Stage):
             f"{kind}.torque_constant", self.torque_constant, p, "N m/A"
         )
         inductance, L = diagonal_parameter(f"{kind}.inductance", self.inductance, p, "H", True)
-        resistance, R = diagonal_parameter(f"{kind}.resistance", self.resistance, p, "ohm")
+        resistance, R = diagonal_parameter(
+            f"{kind}.resistance", self.resistance, p, "ohm", nonnegative=True
+        )
         gears, n = diagonal_parameter(f"{kind}.gear_ratio", ratio, p, "")
-        if (resistance.value < 0).any():
-            raise ModelError(f"{kind}.resistance must not be negative, got {resistance.value}")
         for parameter in (constant, gears):
             if (parameter.value == 0).any():
                 raise ModelError(f"{parameter.name} must not be zero, got {parameter.value}")

@@ -11,7 +11,7 @@ import casadi as ca
 from pydrake.math import RigidTransform
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae import Parameter, Signal, UnilateralInput
+from drake_dae.dae import Parameter, Signal, UnilateralInput, places_of
 from drake_dae.errors import ModelError
 from drake_dae.robots.links import Application, Frames, Kinematics, Links, Reaction
 from drake_dae.robots.surface import Surface, Vector
@@ -34,13 +34,13 @@ class Constraint(ABC):
 
     1. It is an expression of `Kinematics` (its position part of `Frames`) and of its `parameters`,
        smooth in the workspace. These are made once, have names that begin with "<name>.", and may
-       move (see `RobotModel`) if k = m; `rate` is then the part of the derivative from velocities.
-    2. `residual` is phi(q), shape (k, 1), zero if the constraint holds. The first k of the m rows
-       are holonomic; the others restrict velocities alone (nonholonomic, r = 1).
-    3. `rate`, shape (m, 1), is linear in velocities, and zero where the constraint holds; its first
-       k rows are the derivative of `residual`. A constraint with k < m defines it itself. Where it
-       holds, lambda . rate is the power of the forces without friction: lambda is a force in N if
-       the rate is a velocity in m/s. Where `is_unilateral`, lambda >= 0 pushes to the free side.
+       move (see `RobotModel`) if it is holonomic.
+    2. `residual` is phi(q), shape (m, 1), zero if the constraint holds. A nonholonomic one, which
+       restricts velocities alone (r = 1), has none and defines `rate` itself.
+    3. `rate`, shape (m, 1), is linear in velocities, and zero where the constraint holds: without
+       motion of its parameters the derivative of `residual`. Where it holds, lambda . rate is the
+       power of the forces without friction: lambda is a force in N if the rate is a velocity in
+       m/s. Where `is_unilateral`, lambda >= 0 pushes to the free side.
     4. `reaction` is linear in lambda: the gradient of that power by the velocities, and forces
        proportional to lambda, as of friction. `drag` are forces independent of lambda.
     5. `applications` are all these forces, each on one frame and the opposite on another; none if
@@ -88,7 +88,7 @@ class Constraint(ABC):
 
     @property
     def residual_signals(self) -> tuple[Signal, ...]:
-        """Names and units of phi, then of the nonholonomic rows of the rate."""
+        """Names and units of phi, or of the rate of a nonholonomic constraint."""
         units = self.residual_units
         return tuple(Signal(f"{self.name}.{key}", unit) for key, unit in units.items())
 
@@ -103,11 +103,11 @@ class Constraint(ABC):
         return True
 
     def residual(self, frames: Frames) -> ca.SX:
-        """phi(q), shape (k, 1) with k <= m; k = 0 if velocities alone are restricted."""
+        """phi(q), shape (m, 1), or (0, 1) if velocities alone are restricted."""
         return ca.SX(0, 1)
 
     def rate(self, kinematics: Kinematics) -> ca.SX:
-        """phi'(q, v), and nonholonomic rows linear in velocities, shape (m, 1)."""
+        """phi'(q, v), or what restricts velocities alone, shape (m, 1)."""
         return kinematics.derivative(self.residual(kinematics))
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
@@ -171,10 +171,7 @@ class ConstraintSet:
 
     def place(self, name: str) -> int:
         """The index of a constraint force in lambda; ModelError if there is none."""
-        names = [signal.name for signal in self.force_signals]
-        if name not in names:
-            raise ModelError(unknown_name("constraint force", name, names))
-        return names.index(name)
+        return places_of("constraint force", [name], self.force_signals)[0]
 
     def parts(self) -> Iterator[tuple[Constraint, slice]]:
         """Each constraint, and the slice of its constraint forces."""
@@ -193,13 +190,11 @@ class ConstraintSet:
         return ca.vertcat(ca.SX(0, 1), *[c.rate(kinematics) for c in self.constraints])
 
     def constraint_output(self, kinematics: Kinematics) -> ca.SX:
-        """k of (2), shape (m, 1): phi, and the rate of rows that restrict velocities alone."""
+        """k of (2), shape (m, 1): phi, or the rates of those that restrict velocities alone."""
         rows = [ca.SX(0, 1)]
         for constraint in self.constraints:
             residual = constraint.residual(kinematics)
-            rows.append(residual)
-            if residual.numel() < len(constraint.force_signals):
-                rows.append(constraint.rate(kinematics)[residual.numel() :])
+            rows.append(residual if residual.numel() else constraint.rate(kinematics))
         return kinematics.value(ca.vertcat(*rows))
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
@@ -248,11 +243,9 @@ class ConstraintSet:
         acting = constraint.applications(kinematics)
         on_frame = [a for a in acting if frame in (a.frame_a, a.frame_b)]
         if len(on_frame) != 1:
-            frames = ", ".join(dict.fromkeys(f for a in acting for f in (a.frame_a, a.frame_b)))
-            where = "at several points of" if on_frame else "not on"
+            frames = ", ".join(f for a in acting for f in (a.frame_a, a.frame_b))
             raise ModelError(
-                f"constraint '{name}' acts {where} '{frame}', where one point is needed; it acts "
-                f"on {frames or 'no known frame'}"
+                f"constraint '{name}' must act at one point of '{frame}'; it acts on {frames}"
             )
         sign = 1.0 if frame == on_frame[0].frame_b else -1.0
         return on_frame[0].point, sign * on_frame[0].force(constraint_force[part])

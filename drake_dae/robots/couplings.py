@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.inverse_kinematics import AddMultibodyPlantConstraints
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import PrismaticJoint
-from pydrake.solvers import LinearEqualityConstraint, MathematicalProgram
+from pydrake.solvers import MathematicalProgram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
@@ -18,8 +18,8 @@ from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint import Constraint
 from drake_dae.robots.links import Application, Frames, Kinematics, Links, position_index
-from drake_dae.robots.plant_frames import constant_pose, frame_name, joint_names
-from drake_dae.robots.surface import Vector, triple
+from drake_dae.robots.plant_frames import constant_pose, joint_names
+from drake_dae.robots.surface import Vector
 from drake_dae.trace.expressions import length_of
 
 
@@ -263,21 +263,20 @@ class JointCoupler(Constraint):
 def plant_constraints(links: Links) -> tuple[Constraint, ...]:
     """The constraints of the plant of the links, which Drake enforces only in discrete plants.
 
-    Couplers and mimic joints are a `JointCoupler` "<follower>_coupler", rods a `FixedDistance`
-    "rod0", "rod1", ...; others raise ModelError.
+    Couplers and mimic joints are a `JointCoupler` "<follower>_coupler"; others raise ModelError.
     """
     plant = links.plant
     if plant is None or plant.num_constraints() == 0:
         return ()
-    constraints = (*couplings_of(plant), *_rods(plant))
+    constraints = couplings_of(plant)
     others = plant.num_constraints() - len(constraints)
     if others:
         raise ModelError(
             f"the plant has {others} constraint(s) that cannot be read back from it; take them out "
             "of the plant or of its file, and give them as `constraints`: a ball constraint is "
-            "CoincidentPoints, a weld constraint WeldedFrames"
+            "CoincidentPoints, a weld constraint WeldedFrames, a distance constraint FixedDistance"
         )
-    return constraints
+    return tuple(constraints)
 
 
 def couplings_of(plant: MultibodyPlant) -> list[JointCoupler]:
@@ -294,12 +293,11 @@ def couplings_of(plant: MultibodyPlant) -> list[JointCoupler]:
     followers: set[str] = set()
     joints = joint_names(plant)
     names = {joint.position_start(): name for name, joint in joints.items()}
-    index = {variable.get_id(): i for i, variable in enumerate(q)}
-    for binding in program.GetAllConstraints():
-        row = binding.evaluator()
-        if not isinstance(row, LinearEqualityConstraint) or binding.variables().size != 2:
+    for binding in program.linear_equality_constraints():
+        if binding.variables().size != 2:
             continue
-        pair = [names[index[variable.get_id()]] for variable in binding.variables()]
+        row = binding.evaluator()
+        pair = [names[i] for i in program.FindDecisionVariableIndices(binding.variables())]
         factors = [float(factor) for factor in np.reshape(row.GetDenseA(), 2)]
         # The follower has the factor 1. If both have it, either may be; no joint follows twice.
         able = [i for i in (1, 0) if factors[i] == 1.0] or [0]
@@ -311,20 +309,3 @@ def couplings_of(plant: MultibodyPlant) -> list[JointCoupler]:
         unit: Literal["m", "rad"] = "m" if isinstance(joints[follower], PrismaticJoint) else "rad"
         couplers.append(JointCoupler(follower, leader, ratio, offset, unit, f"{follower}_coupler"))
     return couplers
-
-
-def _rods(plant: MultibodyPlant) -> list[FixedDistance]:
-    found = []
-    rods = plant.GetDefaultDistanceConstraintParams()
-    for number, key in enumerate(sorted(rods, key=lambda key: key.get_value())):
-        rod = rods[key]
-        bodies = [plant.get_body(index) for index in (rod.bodyA(), rod.bodyB())]
-        start, end = (frame_name(plant, body.body_frame()) for body in bodies)
-        if np.isfinite(rod.stiffness()):
-            raise ModelError(
-                f"the distance constraint between '{start}' and '{end}' has a stiffness of "
-                f"{rod.stiffness():g} N/m: that is a spring and no rod; add a LinearSpringDamper"
-            )
-        point_a, point_b = (triple("a point", point) for point in (rod.p_AP(), rod.p_BQ()))
-        found.append(FixedDistance(start, point_a, end, point_b, rod.distance(), f"rod{number}"))
-    return found

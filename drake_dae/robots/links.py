@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae import Parameter, Signal, as_expression, signals
+from drake_dae.dae import Parameter, Signal, as_expression, places_of, signals
 from drake_dae.dae.signals import is_symbol
 from drake_dae.errors import ModelError
 
@@ -36,10 +36,7 @@ class Frames(ABC):
 
 def position_index(frames: Frames, name: str) -> int:
     """The index of a name among the generalized positions; ModelError if there is none."""
-    names = [signal.name for signal in frames.position_signals]
-    if name not in names:
-        raise ModelError(unknown_name("joint position", name, names))
-    return names.index(name)
+    return places_of("joint position", [name], frames.position_signals)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +224,9 @@ def velocities_are_rates(links: Links) -> bool:
 class LinkExpressions(Links):
     """Links with given M(q) and H(q, v), as in a textbook; see `Links`.
 
+    Signals are named q0, v0, u0 and so on; there are no limits, no rotors and no gears. Assign to
+    the attributes of `Links` for others, before the links are used.
+
     Args:
         q: Generalized positions, SX symbols, shape (nq, 1).
         v: Generalized velocities, SX symbols, shape (nv, 1).
@@ -236,13 +236,6 @@ class LinkExpressions(Links):
         velocity_map: N(q) of q' = N(q) v, shape (nq, nv); the identity if None.
         actuation_matrix: B of M v' + H = B u, shape (nv, nu); the identity if None.
         parameters: The parameters of the expressions.
-        position_signals, velocity_signals, actuator_signals: Names and units; made up if empty.
-        effort_limits: The largest |u|, shape (nu,); infinite if None.
-        reflected_inertia: The part of M(q) from rotors, kg m^2 (kg), shape (nu,); 0 if None.
-        gear_ratios: Motor turns per joint turn, shape (nu,); 1 if None.
-        default_positions: A typical configuration, shape (nq,); zero if None.
-        position_limits, velocity_limits: The lower and upper limits, shapes (nq,) and (nv,); none
-            if None.
 
     Raises:
         ModelError: A shape does not fit.
@@ -258,15 +251,6 @@ class LinkExpressions(Links):
         velocity_map: ca.SX | None = None,
         actuation_matrix: FloatArray | None = None,
         parameters: tuple[Parameter, ...] = (),
-        position_signals: tuple[Signal, ...] = (),
-        velocity_signals: tuple[Signal, ...] = (),
-        actuator_signals: tuple[Signal, ...] = (),
-        effort_limits: FloatArray | None = None,
-        reflected_inertia: FloatArray | None = None,
-        gear_ratios: FloatArray | None = None,
-        default_positions: FloatArray | None = None,
-        position_limits: tuple[FloatArray, FloatArray] | None = None,
-        velocity_limits: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         for name, symbol in (("q", q), ("v", v)):
             if not is_symbol(symbol):
@@ -274,50 +258,33 @@ class LinkExpressions(Links):
         self.q, self.v, self.parameters = q, v, parameters
         world = {"world": (ca.SX.eye(3), ca.SX(3, 1))}
         self.frames = world | dict(frames or {}) | world
+        self.outlines = tuple(Outline(name, name) for name in self.frames)
         nq, nv = q.numel(), v.numel()
-
-        def fitting(name: str, given: Any, shape: tuple[int, ...]) -> Any:
-            if given.shape != shape:
-                raise ModelError(f"{name} has shape {given.shape}, expected {shape}")
-            return given
 
         def matrix(name: str, given: ca.SX | None, shape: tuple[int, int]) -> ca.SX:
             given = ca.SX.eye(nv) if given is None else given
-            return fitting(name, as_expression("LinkExpressions", name, given), shape)
+            value = as_expression("LinkExpressions", name, given)
+            if value.shape != shape:
+                raise ModelError(f"{name} has shape {value.shape}, expected {shape}")
+            return value
 
         self.mass_matrix = matrix("mass_matrix", mass_matrix, (nv, nv))
         self.bias = matrix("bias", bias, (nv, 1))
         self.velocity_map = matrix("velocity_map", velocity_map, (nq, nv))
         given = np.eye(nv) if actuation_matrix is None else actuation_matrix
-        B = numbers("actuation_matrix", given)
-        if B.ndim != 2 or B.shape[0] != nv:
-            raise ModelError(f"actuation_matrix has shape {B.shape}, expected ({nv}, nu)")
-        self.actuation_matrix, nu = B, B.shape[1]
-        self.position_signals = position_signals or signals([f"q{i}" for i in range(nq)])
-        self.velocity_signals = velocity_signals or signals([f"v{i}" for i in range(nv)])
-        self.actuator_signals = actuator_signals or signals([f"u{i}" for i in range(nu)])
-
-        def array(name: str, given: ArrayLike | None, size: int, default: float) -> FloatArray:
-            values = np.full(size, default) if given is None else numbers(name, given)
-            return fitting(name, values, (size,))
-
-        self.effort_limits = array("effort_limits", effort_limits, nu, np.inf)
-        self.reflected_inertia = array("reflected_inertia", reflected_inertia, nu, 0.0)
-        self.gear_ratios = array("gear_ratios", gear_ratios, nu, 1.0)
-        self.default_positions = array("default_positions", default_positions, nq, 0.0)
-
-        def limits(
-            name: str, given: tuple[ArrayLike, ArrayLike] | None, size: int
-        ) -> tuple[FloatArray, FloatArray]:
-            lower, upper = given or (np.full(size, -np.inf), np.full(size, np.inf))
-            ends = array(name, lower, size, 0.0), array(name, upper, size, 0.0)
-            if not np.all(ends[0] < ends[1]):
-                raise ModelError(f"{name}: the lower limits must be below the upper, got {given!r}")
-            return ends
-
-        self.position_limits = limits("position_limits", position_limits, nq)
-        self.velocity_limits = limits("velocity_limits", velocity_limits, nv)
-        self.outlines = tuple(Outline(name, name) for name in self.frames)
+        self.actuation_matrix = numbers("actuation_matrix", given)
+        if self.actuation_matrix.ndim != 2 or len(self.actuation_matrix) != nv:
+            shape = self.actuation_matrix.shape
+            raise ModelError(f"actuation_matrix has shape {shape}, expected ({nv}, nu)")
+        nu = self.actuation_matrix.shape[1]
+        self.position_signals = signals([f"q{i}" for i in range(nq)])
+        self.velocity_signals = signals([f"v{i}" for i in range(nv)])
+        self.actuator_signals = signals([f"u{i}" for i in range(nu)])
+        self.effort_limits = np.full(nu, np.inf)
+        self.reflected_inertia, self.gear_ratios = np.zeros(nu), np.ones(nu)
+        self.default_positions = np.zeros(nq)
+        self.position_limits = np.full(nq, -np.inf), np.full(nq, np.inf)
+        self.velocity_limits = np.full(nv, -np.inf), np.full(nv, np.inf)
 
     def _pose(self, frame: str) -> ca.SX | tuple[ca.SX, ca.SX]:
         if frame not in self.frames:

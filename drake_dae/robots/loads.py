@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import numbers, positive
+from drake_dae.arrays import each, positive
 from drake_dae.dae import Parameter
 from drake_dae.errors import ModelError
 from drake_dae.robots.links import Kinematics, Reaction, position_index
@@ -79,8 +79,6 @@ class KnownForce(Load):
 class KnownWrench(KnownForce):
     """A force and a moment "<name>.moment", N m, on a frame: so any point of it can be pushed."""
 
-    name: str = "wrench"
-
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         force = Parameter(f"{self.name}.force", np.zeros(3), "N")
@@ -145,13 +143,8 @@ class JointFriction(Load):
     def parameters(self) -> tuple[Parameter, ...]:
         parameters = []
         for name, unit in (("coulomb", "N m"), ("viscous", "N m s")):
-            given = numbers(f"the {name} friction of joints", getattr(self, name))
-            if given.shape not in ((), (len(self.joints),)):
-                raise ModelError(
-                    f"the {name} friction must be a number or one for each of the "
-                    f"{len(self.joints)} joints, got {given.tolist()}"
-                )
-            for joint, value in zip(self.joints, given + np.zeros(len(self.joints)), strict=True):
+            values = each(f"the {name} friction of joints", getattr(self, name), len(self.joints))
+            for joint, value in zip(self.joints, values, strict=True):
                 parameters.append(Parameter(f"{joint}.{name}", value, unit, nonnegative=True))
         return tuple(parameters)
 

@@ -1,6 +1,7 @@
 """Joints at which a loop is cut, as constraints."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, pi
@@ -16,11 +17,9 @@ from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint import Constraint, ConstraintSet
 from drake_dae.robots.couplings import rotation_error
-from drake_dae.robots.links import Application, Frames, Kinematics, Links, Reaction
+from drake_dae.robots.links import Application, Frames, Kinematics, Links
 from drake_dae.robots.plant_frames import without_round_off
-from drake_dae.robots.surface import Letter, Vector
-
-LETTERS = "xyz"
+from drake_dae.robots.surface import LETTERS, Letter, Vector
 
 
 @dataclass(frozen=True)
@@ -101,8 +100,8 @@ class LoopJoint(Constraint):
 
     @property
     @abstractmethod
-    def held_axes(self) -> tuple[str, str]:
-        """The axes of F along which M cannot move, and about which it cannot turn, as letters."""
+    def held_axes(self) -> tuple[Sequence[str], Sequence[str]]:
+        """The axes of F along which M cannot move, and about which it cannot turn."""
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -177,9 +176,8 @@ class RevoluteLoopJoint(LoopJoint):
     In a planar mechanism the three rows out of the plane are redundant: `planar` keeps only the two
     in the plane.
 
-    The angle is measured within half a turn from the middle of the limits (from zero without both
-    limits), and jumps beyond. A joint with full turns may have a damper and a motor, but no limits
-    and no spring.
+    The angle is measured within half a turn from zero, and jumps beyond. A joint with full turns
+    may have a damper and a motor, but no limits and no spring.
 
     Attributes:
         planar: Whether only the two positions normal to the axis are constrained.
@@ -192,22 +190,16 @@ class RevoluteLoopJoint(LoopJoint):
     def __post_init__(self) -> None:
         super().__post_init__()
         ends = [end for end in (*self.limits, self.rest) if np.isfinite(end)]
-        if any(abs(end - self._middle) >= pi for end in ends):
+        if any(abs(end) >= pi for end in ends):
             raise ModelError(
-                f"lower, upper and rest must be within half a turn of {self._middle:g} rad, got "
-                f"{brief(ends)}. Leave out both limits for a continuous joint"
+                f"lower, upper and rest must be within half a turn of 0, got {brief(ends)}; shift "
+                "rpy_a, or leave out both limits for a continuous joint"
             )
 
     @property
-    def _middle(self) -> float:
-        """The middle of the range of the angle."""
-        low, high = self.limits
-        return (low + high) / 2 if np.isfinite(low) and np.isfinite(high) else 0.0
-
-    @property
-    def held_axes(self) -> tuple[str, str]:
-        across = LETTERS.replace(self.axis, "")
-        return (across, "") if self.planar else (LETTERS, across)
+    def held_axes(self) -> tuple[Sequence[str], Sequence[str]]:
+        across = [letter for letter in LETTERS if letter != self.axis]
+        return (across, ()) if self.planar else (LETTERS, across)
 
     def residual(self, frames: Frames) -> ca.SX:
         R_FM, p_FM = self._relative(frames)
@@ -220,9 +212,7 @@ class RevoluteLoopJoint(LoopJoint):
         R_FM, _ = self._relative(frames)
         a = LETTERS.index(self.axis)
         b, c = (a + 1) % 3, (a + 2) % 3  # b x c = a.
-        sine, cosine = R_FM[c, b] - R_FM[b, c], R_FM[b, b] + R_FM[c, c]
-        s, k = np.sin(self._middle), np.cos(self._middle)
-        return self._middle + ca.atan2(sine * k - cosine * s, cosine * k + sine * s)
+        return ca.atan2(R_FM[c, b] - R_FM[b, c], R_FM[b, b] + R_FM[c, c])
 
 
 @checked(ModelError)
@@ -256,11 +246,9 @@ class PrismaticLoopJoint(LoopJoint):
             raise ModelError(f"normal must be another axis than '{self.axis}', the joint's own")
 
     @property
-    def held_axes(self) -> tuple[str, str]:
-        across = LETTERS.replace(self.axis, "")
-        if self.normal is None:
-            return across, LETTERS
-        return across.replace(self.normal, ""), self.normal
+    def held_axes(self) -> tuple[Sequence[str], Sequence[str]]:
+        across = [letter for letter in LETTERS if letter not in (self.axis, self.normal)]
+        return across, LETTERS if self.normal is None else (self.normal,)
 
     def residual(self, frames: Frames) -> ca.SX:
         R_FM, p_FM = self._relative(frames)
@@ -286,26 +274,20 @@ class LoopState:
 
     def __init__(self, constraints: ConstraintSet, links: Links) -> None:
         joints = [joint for joint in constraints.constraints if isinstance(joint, LoopJoint)]
-        kinematics = links.kinematics()
-        coordinates = [joint.coordinates(kinematics) for joint in joints]
-        rates = [kinematics.derivative(c) for c in coordinates]
-        position = kinematics.value(ca.vertcat(ca.SX(0, 1), *coordinates))
-        rate = kinematics.value(ca.vertcat(ca.SX(0, 1), *rates))
+        kinematics, unit = links.kinematics(), ca.SX.sym("unit", len(joints))
+        own = ca.vertcat(ca.SX(0, 1), *[joint.coordinates(kinematics) for joint in joints])
+        own_rate = kinematics.derivative(own)
+        position, rate = kinematics.value(own), kinematics.value(own_rate)
         self.state = ca.vertcat(position, rate)
         named = [signal for joint in joints for signal in joint.coordinate_signals]
         self.signals = (*named, *(signal.derivative(1) for signal in named))
-        fastest = [
-            inf if joint.velocity_limit is None else joint.velocity_limit for joint in joints
-        ]
         low, high = np.reshape([joint.limits for joint in joints], (-1, 2)).T
+        fastest = [joint.velocity_limit or inf for joint in joints]
         self.limits = np.append(low, np.negative(fastest)), np.append(high, fastest)
         driven = [i for i, joint in enumerate(joints) if joint.motor]
-        efforts = [joints[i].effort_limit for i in driven]
-        self.effort_limits = np.array([inf if effort is None else effort for effort in efforts])
-        unit, total = ca.SX.sym("unit", len(joints)), Reaction(ca.SX(links.v.numel(), 1))
-        for i, own in enumerate(rates):
-            total += kinematics.reaction(unit[i] * own)
-        columns = total.map(lambda part: ca.jacobian(part, unit))
+        self.effort_limits = np.array([joints[i].effort_limit or inf for i in driven])
+        reaction = kinematics.reaction(ca.dot(unit, own_rate))
+        columns = reaction.map(lambda part: ca.jacobian(part, unit))
         self.columns = links.generalized_force(kinematics, columns)
         forces = [joint.force(position[i], rate[i]) for i, joint in enumerate(joints)]
         self.force = ca.sparsify(ca.mtimes(self.columns, ca.vertcat(ca.SX(0, 1), *forces)))

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from math import ceil
 from pathlib import Path
 from typing import ClassVar
@@ -10,14 +10,13 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, positive, show, vector
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
-from drake_dae.files import MESHES, check_file, read_mesh, read_text
-from drake_dae.robots.surface import Pair, PosedShape, Surface, Vector, mesh_of_grid, tangents
+from drake_dae.files import MESHES, read_mesh, read_text
+from drake_dae.robots.surface import Pair, Surface, Vector, tangents
 
 CELLS, BEYOND = 16, 3  # Bells along the longer side, and beyond each edge, for a fit there.
 MOST_LENGTH = 1e9  # The largest height and length in m.
@@ -34,20 +33,17 @@ class MeasuredSurface(Surface):
         h(x, y) = c_0 + c_1 x + c_2 y + sum_r a_r(x) b_r(y),
 
     a plane and sums a_r, b_r of bell curves, by least squares, with derivatives of all orders. z is
-    along the normal, x and y along `tangents(normal)`: for the normal z they are x and y, for a
-    wall sideways and upward. Beyond its edges the surface approaches the plane. Of a mesh it is
-    the side that is seen along the normal, which must be without holes and overhangs.
+    along the normal, x and y along `tangents(normal)`. Beyond its edges the surface approaches the
+    plane. Of a mesh it is the side that is seen along the normal, without holes and overhangs.
 
     Attributes:
         size: The lengths of the rectangle, m, shape (2,); None for all of a mesh.
-        heights: Heights above the plane through `point`, shape (r, c): a row is along the first
-            coordinate, and the rows follow each other along the second.
+        heights: Heights above the plane through `point`, shape (r, c), with rows along x.
         file: A file instead: a table (.csv), or a mesh for trimesh.
         point: The middle of a table, or the origin of a mesh, whose axes are the world's, m.
         normal: The direction of the heights and of the free side, of any length, shape (3,).
         scale: The length of a unit of the heights, or of the mesh, m.
-        resolution: The distance of the bells, m; finer details are smoothed. If None, a sixteenth
-            of the longer side, but no less than the heights of a table are apart.
+        resolution: The distance of the bells, m, at first a sixteenth of a side; finer is smoothed.
 
     Raises:
         ModelError: There are no data, or they cannot be read; a mesh has a hole or an overhang.
@@ -66,10 +62,11 @@ class MeasuredSurface(Surface):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.size is not None:
-            object.__setattr__(self, "size", tuple(vector("size", self.size, 2).tolist()))
-        for name in ("size", "scale", "resolution"):
-            for length in np.ravel([] if (value := getattr(self, name)) is None else value):
-                positive(name, length)
+            lengths = vector("size", self.size, 2).tolist()
+            object.__setattr__(self, "size", tuple(positive("size", length) for length in lengths))
+        positive("scale", self.scale)
+        if self.resolution is not None:
+            positive("resolution", self.resolution)
         if (self.heights is None) == (self.file is None):
             raise ModelError("give either heights, row by row, or a file with them")
         if self.heights is not None:
@@ -77,9 +74,54 @@ class MeasuredSurface(Surface):
             object.__setattr__(self, "heights", tuple(map(tuple, rows)))
         _ = self.fit  # Data that cannot be read are told here.
 
-    @property
+    @cached_property
     def fit(self) -> "_Fit":
-        return _fit(self, None if self.file is None else check_file(self.file, ModelError))
+        """The least-squares fit of the data."""
+        if self.file is not None and Path(self.file).suffix.lower() in MESHES:
+            x, y, heights = _mesh_heights(self, Path(self.file))
+        else:
+            if self.size is None:
+                raise ModelError("a table of heights needs its size, two lengths in m")
+            rows = self.heights if self.file is None else _read_table(Path(self.file))
+            heights = self.scale * np.array(rows)
+            counts = zip(self.size, heights.shape[::-1], strict=True)
+            x, y = (length * np.linspace(-0.5, 0.5, count) for length, count in counts)
+        if not (largest := float(np.max(np.abs(heights)))) <= MOST_LENGTH:
+            raise ModelError(f"heights of {largest:.3g} m are no surface; is the scale right?")
+        distance = max(x[1] - x[0], y[1] - y[0], max(np.ptp(x), np.ptp(y)) / CELLS)
+        flat = np.stack([np.ones_like(heights), 0 * heights + x, 0 * heights + y[:, None]], axis=-1)
+        plane = np.linalg.lstsq(flat.reshape(-1, 3), heights.ravel())[0].astype(float)
+        rest = heights - flat @ plane
+        places, widths, at, beyond = [], [], [], []
+        for side in (x, y):
+            length = side[-1] - side[0]
+            count = max(ceil(length / (self.resolution or distance) - 1e-9), 1)
+            widths.append(width := float(length / count))
+            places.append(place := side[0] + width * np.arange(-BEYOND, count + BEYOND + 1))
+            around = np.linspace(place[0] - 3 * width, place[-1] + 3 * width, 3 * place.size)
+            at.append(_bells(side, place, width))
+            beyond.append(_bells(around, place, width))
+        spectra = [np.linalg.svd(bells, full_matrices=False) for bells in at]
+        for least in LEAST:
+            # Orthonormal values at the data, and the bells' factors for them.
+            pairs = [(spectrum, spectrum[1] > least * spectrum[1][0]) for spectrum in spectra]
+            basis_x, basis_y = (values[:, k] for (values, _, _), k in pairs)
+            to_x, to_y = (factors[k].T / sizes[k] for (_, sizes, factors), k in pairs)
+            shares = basis_y.T @ rest @ basis_x
+            outside = beyond[1] @ (to_y @ shares @ to_x.T) @ beyond[0].T
+            if np.max(np.abs(outside)) <= CALM * np.ptp(rest):
+                break
+        # In heights and not in factors, which magnify the round-off of the data a million times.
+        left, sizes, right = np.linalg.svd(shares, full_matrices=False)
+        a, b = to_x @ right.T, to_y @ (left * sizes)
+        terms_a, terms_b = at[0] @ a, at[1] @ b
+        # A wave along one axis takes one term; others are below the residual, or round-off.
+        rms = float(np.sqrt(np.mean((rest - terms_b @ terms_a.T) ** 2)))
+        added = np.max(np.abs(terms_a), axis=0) * np.max(np.abs(terms_b), axis=0)
+        n = int(np.sum(np.cumsum(added[::-1])[::-1] > max(0.1 * rms, 1e-10 * float(np.ptp(rest)))))
+        largest = float(np.max(np.abs(rest - terms_b[:, :n] @ terms_a[:, :n].T)))
+        extent = np.column_stack([x[[0, -1]], y[[0, -1]]])
+        return _Fit(extent, plane, places, widths, (a[:, :n], b[:, :n]), largest)
 
     def distance(self, offset: ca.SX) -> ca.SX:
         x, y = ca.vertsplit(self.coordinates(offset))
@@ -100,15 +142,6 @@ class MeasuredSurface(Surface):
         off, width = 1e3 * self.fit.largest, 1e3 * max(self.fit.widths)
         smoothed = f"details finer than {width:.2g} mm are smoothed away"
         return f"MeasuredSurface{source} is off its data by at most {off:.2g} mm; {smoothed}"
-
-    def picture(self, center: ArrayLike, size: float) -> PosedShape:
-        even = np.linspace(-0.5, 0.5, 3 * CELLS + 1)
-        grid = self._patch(np.zeros(3), size, even, even)
-        return PosedShape(mesh_of_grid(grid.swapaxes(0, 1)), RigidTransform())
-
-    def _lengths(self, size: float) -> Pair:
-        length, width = np.ptp(self.extent, axis=0)
-        return float(length), float(width)
 
     def _patch(
         self, center: FloatArray, size: float, rows: FloatArray, columns: FloatArray
@@ -155,56 +188,6 @@ def _bells(values: FloatArray, places: FloatArray, width: float) -> FloatArray:
     return np.asarray(np.exp(-(((values[:, None] - places) / width) ** 2) / 2))
 
 
-@lru_cache(maxsize=16)
-def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
-    """The least-squares fit; kept as long as the file, of which the stamp tells, is the same."""
-    if surface.file is not None and Path(surface.file).suffix.lower() in MESHES:
-        x, y, heights = _mesh_heights(surface, Path(surface.file))
-    else:
-        if surface.size is None:
-            raise ModelError("a table of heights needs its size, two lengths in m")
-        rows = surface.heights if surface.file is None else _read_table(Path(surface.file))
-        heights = surface.scale * np.array(rows)
-        counts = zip(surface.size, heights.shape[::-1], strict=True)
-        x, y = (length * np.linspace(-0.5, 0.5, count) for length, count in counts)
-    if not (largest := float(np.max(np.abs(heights)))) <= MOST_LENGTH:
-        raise ModelError(f"heights of up to {largest:.3g} m are no surface; is the scale right?")
-    distance = max(x[1] - x[0], y[1] - y[0], max(np.ptp(x), np.ptp(y)) / CELLS)
-    flat = np.stack([np.ones_like(heights), 0 * heights + x, 0 * heights + y[:, None]], axis=-1)
-    plane = np.linalg.lstsq(flat.reshape(-1, 3), heights.ravel())[0].astype(float)
-    rest = heights - flat @ plane
-    places, widths, at, beyond = [], [], [], []
-    for side in (x, y):
-        length = side[-1] - side[0]
-        count = max(ceil(length / (surface.resolution or distance) - 1e-9), 1)
-        widths.append(width := float(length / count))
-        places.append(place := side[0] + width * np.arange(-BEYOND, count + BEYOND + 1))
-        around = np.linspace(place[0] - 3 * width, place[-1] + 3 * width, 3 * place.size)
-        at.append(_bells(side, place, width))
-        beyond.append(_bells(around, place, width))
-    spectra = [np.linalg.svd(bells, full_matrices=False) for bells in at]
-    for least in LEAST:
-        # Orthonormal values at the data, and the bells' factors for them.
-        pairs = [(spectrum, spectrum[1] > least * spectrum[1][0]) for spectrum in spectra]
-        basis_x, basis_y = (values[:, k] for (values, _, _), k in pairs)
-        to_x, to_y = (factors[k].T / sizes[k] for (_, sizes, factors), k in pairs)
-        shares = basis_y.T @ rest @ basis_x
-        outside = beyond[1] @ (to_y @ shares @ to_x.T) @ beyond[0].T
-        if np.max(np.abs(outside)) <= CALM * np.ptp(rest):
-            break
-    # In heights and not in factors, which magnify the round-off of the data a million times.
-    left, sizes, right = np.linalg.svd(shares, full_matrices=False)
-    a, b = to_x @ right.T, to_y @ (left * sizes)
-    terms_a, terms_b = at[0] @ a, at[1] @ b
-    # A wave along one axis takes one term; others are below the residual, or round-off.
-    rms = float(np.sqrt(np.mean((rest - terms_b @ terms_a.T) ** 2)))
-    added = np.max(np.abs(terms_a), axis=0) * np.max(np.abs(terms_b), axis=0)
-    n = int(np.sum(np.cumsum(added[::-1])[::-1] > max(0.1 * rms, 1e-10 * float(np.ptp(rest)))))
-    largest = float(np.max(np.abs(rest - terms_b[:, :n] @ terms_a[:, :n].T)))
-    extent = np.column_stack([x[[0, -1]], y[[0, -1]]])
-    return _Fit(extent, plane, places, widths, (a[:, :n], b[:, :n]), largest)
-
-
 def _read_table(file: Path) -> FloatArray:
     """The heights in a .csv file, first row lowest."""
     try:
@@ -220,11 +203,10 @@ def _read_table(file: Path) -> FloatArray:
 
 
 def _table(what: str, rows: ArrayLike) -> FloatArray:
-    heights = numbers(f"{what}: heights", rows)
+    heights = numbers(what, rows)
     if heights.ndim != 2 or min(heights.shape) < 2:
         raise ModelError(f"{what}: heights are two rows of two at least, got {heights.shape}")
-    if not np.all(np.isfinite(heights)):
-        row, column = np.argwhere(~np.isfinite(heights))[0] + 1
+    for row, column in np.argwhere(~np.isfinite(heights))[:1] + 1:
         raise ModelError(f"{what}: row {row}, column {column} is no height")
     return heights
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, listed, show, vector
+from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae import DaeSystem, Parameter, Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation import ActuationChain, Stage, chain, diagonal_parameter
@@ -110,7 +110,7 @@ class RobotModel:
                 "drive theirs through stages: the control would reach the outputs at different "
                 "orders. Cut the loop at a joint without motor"
             )
-        choice = control_choice(name, control_weights, (*driven.control_signals, *bound.motors))
+        choice = control_choice(control_weights, (*driven.control_signals, *bound.motors))
         self.stages = driven.stages
         self.joint_force = driven.joint_force if driven.stages else None
         efforts = links.effort_limits
@@ -133,7 +133,15 @@ class RobotModel:
                 )
         if compliances is not None:
             self.dae = share_forces(self.dae, compliances=compliances)
-        self._check_mass_matrix(nominal)
+        mass = self.dae.matrix("mass_matrix", self.dae.mass_matrix)
+        nq, nv = links.velocity_map.shape
+        M = mass(self.dae.nominal_state, self.dae.parameter_values)[nq : nq + nv, nq : nq + nv]
+        if (smallest := float(np.linalg.eigvalsh(M)[0])) <= 0.0:
+            raise ModelError(
+                f"{name}: M(q) is not positive definite at the nominal configuration: smallest "
+                f"eigenvalue {smallest:.2g}. A link without inertia cannot be moved by a force; "
+                "give it mass, or weld it"
+            )
         # Redundant rows mislead Newton's method.
         rows = [row for row in ca.vertsplit(self.dae.k) if not ca.depends_on(row, links.v)]
         phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
@@ -242,12 +250,6 @@ class RobotModel:
         """
         return cls(MultibodyExpressions(plant), *arguments, **options)
 
-    def __repr__(self) -> str:
-        constraints = listed(constraint.name for constraint in self.constraints)
-        outputs = listed(signal.name for signal in self.dae.output_signals)
-        count = f"positions={self.links.q.numel()}"
-        return f"RobotModel('{self.name}', {count}, constraints={constraints}, outputs={outputs})"
-
     @property
     def position_signals(self) -> tuple[Signal, ...]:
         """Names and units of z_1."""
@@ -341,7 +343,15 @@ class RobotModel:
         """
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
         load = vector(f"{self.name}: forces", forces, self._num_forces)
-        return self.balance.state(q, load, self.dae.parameter_vector(parameters))
+        if not self.stages:  # Forces enter no state.
+            return np.concatenate([q, np.zeros(self.links.v.numel())])
+        state, _, left = self.balance.rest(q, load, self.dae.parameter_vector(parameters))
+        if left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
+            raise ModelError(
+                f"{self.name}: no control holds the robot at rest at q = {show(q)} with forces "
+                f"{load}; {left:.2g} N m is left. It has fewer actuators than joints"
+            )
+        return state
 
     def _check_outputs(
         self, motors: Sequence[Signal], positions: Sequence[Signal], is_chosen: bool
@@ -352,12 +362,6 @@ class RobotModel:
         forces, count = self._num_forces, self._num_forces + len(positions)
         nu = len(actuators) + len(motors)
         given = f"{forces} constraint forces and {len(positions)} positions ({names})"
-        if nu == 0 and count:
-            raise ModelError(
-                f"{self.name}: there are no actuators, so nothing can be steered: not {given}. To "
-                "simulate it leave both out; to steer it give joints actuators, by "
-                "plant.AddJointActuator or a <transmission>"
-            )
         if is_chosen:
             if not 0 < count < nu:
                 raise ModelError(
@@ -376,24 +380,7 @@ class RobotModel:
             raise ModelError(
                 f"{self.name}: {nu} actuators can steer {nu} outputs, not {given}; for fewer, "
                 "control_weights choose the control; for more, name in `forces` those that shall "
-                "be steered, [] for none, or add actuators"
-            )
-
-    def _check_mass_matrix(self, nominal: FloatArray) -> None:
-        """Refuses an M, without rotors that move with a stage, that is not positive definite."""
-        dae, (nq, nv) = self.dae, self.links.velocity_map.shape
-        inputs = {"q": self.links.q, "parameters": dae.parameter_symbol}
-        expression = dae.mass_matrix[nq : nq + nv, nq : nq + nv]
-        function = TracedFunction("mass matrix", inputs, {"mass_matrix": expression})
-        mass = np.atleast_2d(function(nominal, dae.parameter_values)[0])
-        asymmetry = np.abs(mass - mass.T).max()
-        if asymmetry > 1e-9 * np.abs(mass).max():
-            raise ModelError(f"{self.name}: M(q) is not symmetric, by {asymmetry:.2g}")
-        if (smallest := float(np.linalg.eigvalsh(mass)[0])) <= 0.0:
-            raise ModelError(
-                f"{self.name}: M(q) is not positive definite at the nominal configuration: "
-                f"smallest eigenvalue {smallest:.2g}. A link without inertia cannot be moved by a "
-                "force; give it mass, or weld it"
+                "be steered, [] for none, or add actuators: plant.AddJointActuator, <transmission>"
             )
 
     def _on_constraints(self, default: FloatArray) -> FloatArray:
@@ -410,21 +397,13 @@ class RobotModel:
         )
 
 
-def control_choice(
-    name: str, weights: ArrayLike | None, controls: Sequence[Signal]
-) -> tuple[Parameter, ...]:
+def control_choice(weights: ArrayLike | None, controls: Sequence[Signal]) -> tuple[Parameter, ...]:
     """The parameters "control_weights" and "free_control" of the least sum w_i (u_i - u_0i)^2."""
     if weights is None:
         return ()
-    units = sorted({signal.unit for signal in controls})
-    if np.ndim(weights) == 0 and len(units) > 1:
-        raise ModelError(
-            f"{name}: the controls are in {' and '.join(units)}, which one weight cannot compare; "
-            "give each a weight, as 1 / limit^2"
-        )
-    nu = len(controls)
+    nu, units = len(controls), {signal.unit for signal in controls}
     chosen, _ = diagonal_parameter("control_weights", weights, nu, "", positive=True)
-    return chosen, Parameter("free_control", np.zeros(nu), units[0] if len(units) == 1 else "")
+    return chosen, Parameter("free_control", np.zeros(nu), units.pop() if len(units) == 1 else "")
 
 
 class StaticBalance:
@@ -439,26 +418,13 @@ class StaticBalance:
         balance = ca.vertcat(balance, ca.mtimes(S, force) - load)
         all_forces = ca.substitute(dae.forces(force), v, ca.SX.zeros(v.numel()))
         unknown = ca.vertcat(dae.state[links:], control, force)
-        self._unknowns = unknown.numel()
-        self._robot, self._stages = dae.name, dae.num_states - links
+        self._unknowns, self._stages = unknown.numel(), dae.num_states - links
         self._still = np.zeros(v.numel())
         self._function = TracedFunction(
             f"{dae.name} equilibrium",
             {"q": q, "z_2": load, "s, u, lambda": unknown, "parameters": dae.parameter_symbol},
             {"balance": balance, "gradient": ca.jacobian(balance, unknown), "lambda": all_forces},
         )
-
-    def state(self, q: FloatArray, forces: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The state at rest; ModelError if no drive holds the robot there."""
-        if not self._stages:  # Forces enter no state.
-            return np.concatenate([q, self._still])
-        state, _, left = self.rest(q, forces, parameters)
-        if left > 1e-6 * (1.0 + float(np.max(np.abs(forces), initial=0.0))):
-            raise ModelError(
-                f"{self._robot}: no control holds the robot at rest at q = {show(q)} with forces "
-                f"{forces}; {left:.2g} N m is left. It has fewer actuators than joints"
-            )
-        return state
 
     def rest(
         self, q: FloatArray, forces: FloatArray, parameters: FloatArray

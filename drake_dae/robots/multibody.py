@@ -24,11 +24,9 @@ from pydrake.multibody.tree import (
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae import Parameter, Signal
-from drake_dae.dae.signals import LARGEST
 from drake_dae.errors import ModelError
 from drake_dae.robots.links import ORIGIN, Application, Kinematics, Links, Reaction, position_index
 from drake_dae.robots.plant_frames import (
-    check_joint,
     constant_pose,
     elementary_joints,
     frame_name,
@@ -77,15 +75,13 @@ class MultibodyExpressions(Links):
     def __init__(self, plant: MultibodyPlant, scene_graph: SceneGraph | None = None) -> None:
         if not plant.is_finalized():
             raise ModelError("a finalized MultibodyPlant is needed; call plant.Finalize() first")
-        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-        for joint in joints:
-            check_joint(joint)
         if plant.num_velocities() == 0:
             raise ModelError("the plant has no joint that moves")
         self.plant: MultibodyPlant = plant
         self._bodies = [plant.get_body(BodyIndex(i)) for i in range(plant.num_bodies())]
         self.outlines = outlines_of(plant, scene_graph, self._bodies)
-        joints = [joint for joint in joints if joint.num_velocities() > 0]
+        every = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        joints = [joint for joint in every if joint.num_velocities() > 0]
         joints.sort(key=lambda joint: joint.velocity_start())
         self._read_signals(joints)
         self._read_actuators()
@@ -175,10 +171,13 @@ class MultibodyExpressions(Links):
         positions, velocities = [], []
         for joint, name in zip(joints, unique_names(self.plant, joints), strict=True):
             for k in range(joint.num_positions()):
-                suffix = f"_{joint.position_suffix(k)}" if joint.num_positions() > 1 else ""
-                unit = "rad" if self._is_turned(joint, k) else "m"
-                positions.append(Signal(f"{name}{suffix}", unit))
-                velocities.append(Signal(f"{name}_{joint.velocity_suffix(k)}", f"{unit}/s"))
+                suffix = joint.position_suffix(k)
+                named = f"{name}_{suffix}" if joint.num_positions() > 1 else name
+                positions.append(Signal(named, "rad" if suffix[0] == "q" else "m"))
+            for suffix in map(joint.velocity_suffix, range(joint.num_velocities())):
+                velocities.append(
+                    Signal(f"{name}_{suffix}", "rad/s" if suffix[0] == "w" else "m/s")
+                )
         self.position_signals, self.velocity_signals = tuple(positions), tuple(velocities)
 
     def _read_actuators(self) -> None:
@@ -186,28 +185,17 @@ class MultibodyExpressions(Links):
         every = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
         actuators = sorted(every, key=lambda actuator: actuator.input_start())
         self.actuator_signals = tuple(
-            Signal(name, "N m" if self._is_turned(actuator.joint()) else "N")
+            Signal(name, "N m" if actuator.joint().position_suffix(0) == "q" else "N")
             for actuator, name in zip(actuators, unique_names(plant, actuators), strict=True)
         )
         self.actuation_matrix = np.array(plant.MakeActuationMatrix())
         self.effort_limits = np.array([a.effort_limit() for a in actuators])
         self.gear_ratios = np.array([a.default_gear_ratio() for a in actuators])
-        for actuator, ratio in zip(actuators, self.gear_ratios, strict=True):
-            if not (np.isfinite(ratio) and ratio != 0.0):
-                raise ModelError(
-                    f"the gear ratio of '{actuator.name()}' is {ratio:g}; it must be another number"
-                )
         self.reflected_inertia = np.array([a.default_reflected_inertia() for a in actuators])
         # As in Drake, the last of several actuators of a joint is used.
         self._rotors = np.zeros(plant.num_velocities())
         for actuator in every:
             self._rotors[actuator.joint().velocity_start()] = actuator.default_reflected_inertia()
-
-    def _is_turned(self, joint: Joint, k: int = 0) -> bool:
-        """Whether the k-th position and velocity of a joint are angular."""
-        parts, _ = elementary_joints(self.plant, joint)
-        turns = [place for part in parts if part.axis is not None for place in part.positions]
-        return joint.position_start() + k in turns
 
     def _read_masses(self) -> tuple[Parameter, ...]:
         """Makes every mass a parameter, and adds the bodies' inertias to their links.
@@ -242,13 +230,6 @@ class MultibodyExpressions(Links):
 
     def _read_springs(self, joints: Sequence[Joint]) -> None:
         """The generalized force of dampers and springs, shape (nv, 1)."""
-        for joint in joints:
-            largest = np.max(joint.default_damping_vector(), initial=0.0)
-            if largest > LARGEST:
-                raise ModelError(
-                    f"joint '{joint.name()}' has a damping of {largest:g}, and the largest that "
-                    f"can be computed with is {LARGEST:g}"
-                )
         damping = np.concatenate([joint.default_damping_vector() for joint in joints])
         force = -ca.SX(damping) * self.v
         for i in range(self.plant.num_force_elements()):

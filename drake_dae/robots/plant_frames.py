@@ -129,36 +129,13 @@ def _corners(shape: object) -> tuple[FloatArray, float]:
     return np.zeros((0, 3)), 0.0
 
 
-SUPPORTED_JOINTS = (
-    *(RevoluteJoint, PrismaticJoint, WeldJoint, ScrewJoint),
-    *(UniversalJoint, PlanarJoint, BallRpyJoint, RpyFloatingJoint),
-)
-
-
-def check_joint(joint: Joint) -> None:
-    """Refuses a joint that is not a sequence of rotations and translations."""
-    if isinstance(joint, SUPPORTED_JOINTS):
-        return
-    if joint.is_ephemeral():
-        raise ModelError(
-            f"body '{joint.child_body().name()}' is free, so Finalize gave it a "
-            f"{joint.type_name()} joint, which is not supported. Before Finalize, weld it to the "
-            "world (plant.WeldFrames), or add an RpyFloatingJoint from the world to it"
-        )
-    names = ", ".join(supported.kTypeName for supported in SUPPORTED_JOINTS)
-    raise ModelError(
-        f"joint '{joint.name()}' has type {joint.type_name()}, which is not supported; "
-        f"supported are {names}"
-    )
-
-
 def elementary_joints(
     plant: MultibodyPlant, joint: Joint, reverse: bool = False
 ) -> tuple[list[ElementaryJoint], FloatArray]:
     """A joint as elementary ones from inboard to outboard, and R with X_FM(q) = R (joints) R^T.
 
-    R turns an oblique axis into a coordinate axis, which saves operations. A `reverse` joint leads
-    from child to parent; Drake allows it for revolute, prismatic and weld joints.
+    R turns an oblique axis into a coordinate axis, which saves operations. A `reverse` joint, which
+    is revolute, prismatic or a weld, leads from child to parent. Others raise ModelError.
     """
     sign = -1.0 if reverse else 1.0
     i, j = joint.position_start(), joint.velocity_start()
@@ -195,7 +172,16 @@ def elementary_joints(
             return roll_pitch_yaw, unit
         case RpyFloatingJoint():
             return [shift(unit, 3), *roll_pitch_yaw], unit
-    return [], unit
+    if joint.is_ephemeral():
+        raise ModelError(
+            f"body '{joint.child_body().name()}' is free, so Finalize gave it a "
+            f"{joint.type_name()} joint, which is not supported. Before Finalize, weld it to the "
+            "world (plant.WeldFrames), or add an RpyFloatingJoint from the world to it"
+        )
+    raise ModelError(
+        f"joint '{joint.name()}' has type {joint.type_name()}, which is no sequence of rotations "
+        "and translations"
+    )
 
 
 def joint_velocity_map(joint: Joint, q: ca.SX) -> ca.SX:

@@ -4,7 +4,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -56,48 +56,8 @@ def mesh_of_grid(points: FloatArray) -> TriangleSurfaceMesh:
     return TriangleSurfaceMesh(triangles, list(flat[used]))
 
 
-def layer_below(grid: FloatArray, surface: TracedFunction, depth: float) -> PosedShape:
-    """A layer of tetrahedra below the points of a grid, shape (r, c, 3).
-
-    The pressure of a hydroelastic mesh is linear in each tetrahedron, zero on its boundary, and the
-    modulus where a vertex is farthest from it: at `depth` below the grid, so that it is that of a
-    half space. One vertex is far below. `surface` gives distance and gradient at a point.
-    """
-    _check_whole(grid)
-    flat = grid.reshape(-1, 3)
-    normals = np.array([surface(point)[1] for point in flat])
-    mean = normals.mean(axis=0)
-    apex = flat.mean(axis=0) - _APEX * np.ptp(flat, axis=0).max() * mean / np.linalg.norm(mean)
-    points = np.vstack([np.stack([flat, flat - depth * normals], axis=1).reshape(-1, 3), apex])
-    number = np.arange(len(points) - 1).reshape(*grid.shape[:2], 2)
-    cut = slice(None, -1), slice(1, None)
-    corners = [number[cut[k & 1], cut[k >> 1 & 1], k >> 2].ravel() for k in range(8)]
-    corners.append(np.full(corners[0].size, len(points) - 1))
-    tetrahedra = np.stack(corners, axis=-1)[:, _TETRAHEDRA].reshape(-1, 4)
-    edges = grid[1, 0] - grid[0, 0], grid[0, 1] - grid[0, 0], -normals[0]
-    if np.linalg.det(edges) < 0.0:
-        tetrahedra = tetrahedra[:, [0, 1, 3, 2]]
-    if not np.all(np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) > 0.0):
-        raise ModelError(
-            "the surface is too curved for one layer; give a smaller piece (plant.piece)"
-        )
-    count = len(tetrahedra)
-    lines = ["# vtk DataFile Version 3.0", "layer", "ASCII", "DATASET UNSTRUCTURED_GRID"]
-    lines += [f"POINTS {len(points)} double"]
-    lines += [f"{x:.12g} {y:.12g} {z:.12g}" for x, y, z in points]
-    lines += [f"CELLS {count} {5 * count}"]
-    lines += ["4 " + " ".join(map(str, row)) for row in tetrahedra.tolist()]
-    lines += [f"CELL_TYPES {count}", *["10"] * count, ""]
-    file = MemoryFile("\n".join(lines), ".vtk", "layer")
-    return PosedShape(Mesh(mesh_data=InMemoryMesh(mesh_file=file)), RigidTransform())
-
-
-def _check_whole(grid: FloatArray) -> None:
-    if not np.all(np.isfinite(grid)):
-        raise ModelError("the surface ends within the piece; use a smaller plant.piece")
-
-
 Letter = Literal["x", "y", "z"]
+LETTERS: tuple[Letter, ...] = ("x", "y", "z")
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]
 
@@ -117,7 +77,7 @@ class Surface(ABC):
     3. `coordinates` are coordinates along the surface, one row for each of `coordinate_signals`;
        with the distance they determine a point, except at poles. A surface may have none.
     4. `has_exact_distance` says whether the distance is exact also off the surface: its gradient
-       has length one there. Balls roll only on such surfaces.
+       has length one there.
     5. `picture` is the surface around a point. By default it is drawn from its distance; surfaces
        with a known shape return that.
     6. `shape` are named numbers of its form that may vary; most surfaces have none. `shaped` is the
@@ -200,11 +160,16 @@ class Surface(ABC):
         return ()
 
     def layer(self, center: ArrayLike, size: float, depth: float) -> PosedShape:
-        """A mesh of a thickness `depth` below a piece of the surface; arguments as of `picture`."""
+        """A layer of tetrahedra below a piece of the surface; `center` and `size` as of `picture`.
+
+        The pressure of a hydroelastic mesh is linear in each tetrahedron, zero on its boundary, and
+        the modulus where a vertex is farthest from it: at `depth`, so that it is that of a half
+        space. One vertex is far below.
+        """
         place, ends = np.asarray(center, float), []
-        even = self._patch(place, size, EVEN, EVEN)
-        _check_whole(even)
-        for axis, length in enumerate(self._lengths(size)):
+        even = self._whole_patch(place, size, EVEN, EVEN)
+        lengths = (size, size) if self.extent is None else np.ptp(self.extent, axis=0)
+        for axis, length in enumerate(lengths):
             bend = np.linalg.norm(np.diff(even, 2, axis=axis), axis=-1).max() / 8.0
             needed = np.ceil((EVEN.size - 1) * (bend / _SAG) ** 0.5)
             if not (rim := _RIM * depth / length) < 0.25:
@@ -215,11 +180,39 @@ class Surface(ABC):
                 )
             inner = np.linspace(rim - 0.5, 0.5 - rim, int(np.clip(needed, _LEAST, _MOST)) + 1)
             ends.append(np.concatenate([[-0.5], inner, [0.5]]))
-        return layer_below(self._patch(place, size, *ends), self._linear(), depth)
+        grid, function = self._whole_patch(place, size, *ends), self._linear()
+        flat = grid.reshape(-1, 3)
+        normals = np.array([function(point)[1] for point in flat])
+        mean = normals.mean(axis=0)
+        apex = flat.mean(axis=0) - _APEX * np.ptp(flat, axis=0).max() * mean / np.linalg.norm(mean)
+        points = np.vstack([np.stack([flat, flat - depth * normals], axis=1).reshape(-1, 3), apex])
+        number = np.arange(len(points) - 1).reshape(*grid.shape[:2], 2)
+        cut = slice(None, -1), slice(1, None)
+        corners = [number[cut[k & 1], cut[k >> 1 & 1], k >> 2].ravel() for k in range(8)]
+        corners.append(np.full(corners[0].size, len(points) - 1))
+        tetrahedra = np.stack(corners, axis=-1)[:, _TETRAHEDRA].reshape(-1, 4)
+        edges = grid[1, 0] - grid[0, 0], grid[0, 1] - grid[0, 0], -normals[0]
+        if np.linalg.det(edges) < 0.0:
+            tetrahedra = tetrahedra[:, [0, 1, 3, 2]]
+        if not np.all(np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) > 0.0):
+            raise ModelError(
+                "the surface is too curved for one layer; give a smaller piece (plant.piece)"
+            )
+        count = len(tetrahedra)
+        lines = ["# vtk DataFile Version 3.0", "layer", "ASCII", "DATASET UNSTRUCTURED_GRID"]
+        lines += [f"POINTS {len(points)} double"]
+        lines += [f"{x:.12g} {y:.12g} {z:.12g}" for x, y, z in points]
+        lines += [f"CELLS {count} {5 * count}"]
+        lines += ["4 " + " ".join(map(str, row)) for row in tetrahedra.tolist()]
+        lines += [f"CELL_TYPES {count}", *["10"] * count, ""]
+        file = MemoryFile("\n".join(lines), ".vtk", "layer")
+        return PosedShape(Mesh(mesh_data=InMemoryMesh(mesh_file=file)), RigidTransform())
 
-    def _lengths(self, size: float) -> Pair:
-        """The lengths of a patch along rows and columns in m."""
-        return size, size
+    def _whole_patch(self, *arguments: Any) -> FloatArray:
+        grid = self._patch(*arguments)
+        if not np.all(np.isfinite(grid)):
+            raise ModelError("the surface ends within the piece; use a smaller plant.piece")
+        return grid
 
     def _linear(self) -> TracedFunction:
         """A point -> its distance, and the gradient of the distance."""

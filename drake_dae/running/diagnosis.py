@@ -40,7 +40,7 @@ class RunWatch:
         self._plant = plants[0] if len(plants) == 1 else None
         self._controller = next((b for b in self._blocks if isinstance(b, Controller)), None)
         self._watches = {p: DivergenceWatch(p) for p in plants if not may_diverge}
-        self.is_needed, self._steps, self._seen = bool(self._watches), 0, context.get_time()
+        self._steps, self._seen = 0, context.get_time()
         self._longest, self._collapsed = 0.0, np.inf
 
     def look(self, context: Context, steps: int = 0, *, is_last: bool = False) -> None:

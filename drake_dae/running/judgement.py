@@ -72,20 +72,18 @@ class RunFinding:
 
 @dataclass(frozen=True)
 class OutputQuality:
-    """How well an output followed its reference: z - r, in its unit.
-
-    `off_prediction` is the largest deviation from the predicted error (30); `within_since` the time
-    in s from which |z - r| stayed within the tolerance, None if it was outside at the end.
-    """
+    """How well an output followed its reference: z - r, in its unit."""
 
     signal: Signal
     start: float
     largest: float
     final: float
     late_rms: float
-    off_prediction: float
+    off_prediction: float  # the largest deviation from the predicted error (30)
     tolerance: float
-    within_since: float | None
+    within_since: (
+        float | None
+    )  # in s, |z - r| stayed within the tolerance; None: outside at the end
 
 
 @dataclass(frozen=True)
@@ -110,10 +108,7 @@ class RunSummary:
     Without phases, each output must be within its tolerance from the first half of the run on, or
     from the time at which the predicted error is. If the predicted error exceeds the tolerance even
     at the end, and the run follows it, the run is undecided; so it is if it is off the prediction
-    for no known reason. With phases, the last one must end. `reasons` explain a deviation,
-    `accuracy` is that of error control, and `ended` why the run broke off. `remedies` are what to
-    look at beside the causes of the findings, `notes` what is approximate, and `named` the
-    parameters that the user had estimated; statistics are None for a failed run.
+    for no known reason. With phases, the last one must end.
     """
 
     record: Record
@@ -121,14 +116,14 @@ class RunSummary:
     ranges: Sequence[SignalRange] = ()
     tolerances: Mapping[str, float] = field(default_factory=dict)
     changes: Sequence[PhaseChange] = ()
-    ended: str = ""
-    accuracy: float | None = None
-    reasons: Sequence[str] = ()
+    ended: str = ""  # why the run broke off
+    accuracy: float | None = None  # of error control
+    reasons: Sequence[str] = ()  # of a deviation from the prediction
     more: Sequence[RunFinding] = ()
-    statistics: RunStatistics | None = None
-    remedies: Sequence[str] = ()
-    notes: Sequence[str] = ()
-    named: Collection[str] = ()
+    statistics: RunStatistics | None = None  # None for a failed run
+    remedies: Sequence[str] = ()  # what to look at beside the causes of the findings
+    notes: Sequence[str] = ()  # what is approximate
+    named: Collection[str] = ()  # the parameters that the user had estimated
 
     def __str__(self) -> str:
         reasons = [finding.text for finding in self.findings]
@@ -438,7 +433,7 @@ class RunSummary:
 
 
 def _identified(record: Record, named: Collection[str]) -> Iterator[tuple[str, str]]:
-    """What an estimator found at the end that is new or that the user named, and how many more."""
+    """What an estimator found at the end that is new or that the user named."""
     if "identified" not in record.signals:
         if "friction" in record.signals:
             recorded = record.signals["friction"]
@@ -450,19 +445,12 @@ def _identified(record: Record, named: Collection[str]) -> Iterator[tuple[str, s
     # The first row has the deviations of values that are equally likely within their bounds.
     is_excited = own < UNEXCITED * deviations[0]
     is_named = np.array([s.name.partition("[")[0] in named for s in recorded.signals])
-    is_told = is_excited & (is_named | (np.abs(found - believed) > SURE * own))
-    for i in np.flatnonzero(is_told):
+    for i in np.flatnonzero(is_excited & (is_named | (np.abs(found - believed) > SURE * own))):
         signal = recorded.signals[i]
         yield "identified", f"{signal.name} = {found[i]:.3g} +- {own[i]:.1g} {signal.unit}".rstrip()
     if (is_named & ~is_excited).any():
         names = ", ".join(recorded.signals[i].name for i in np.flatnonzero(is_named & ~is_excited))
         yield "not identified", f"{names}: this motion does not excite them"
-    counts = (
-        (np.sum(is_excited & ~is_told), "more within two deviations of what the law believes"),
-        (np.sum(~is_excited & ~is_named), "more that this motion does not excite"),
-    )
-    if texts := [f"{count} {text}" for count, text in counts if count]:
-        yield "estimated", ", ".join(texts)
 
 
 def _named(values: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Runs a diagram: progress, clean interruption, and statistics."""
 
-import os
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -84,13 +82,8 @@ def simulate(
     _clear_later(diagram, context, start)
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
-    start, began, steps = context.get_time(), 0.0, 0
+    start, steps, composed = context.get_time(), 0, None
     watch = RunWatch(diagram, context, may_diverge)
-
-    def stop(number: signal.Signals) -> None:
-        ending(number)
-        if began:
-            simulator.set_monitor(monitor)
 
     def seen(current: Context, steps: int) -> bool:
         bar.show(current.get_time() - start)
@@ -105,19 +98,15 @@ def simulate(
         return EventStatus.ReachedTermination(diagram, "interrupted")
 
     bar, ending = _Progress(duration, progress), Interruption()
-    with closing(bar), ending_signals(stop):
+    with closing(bar), ending_signals(ending):
         try:
             simulator.Initialize()
             began = time.perf_counter()
             watch.look(context, is_last=True)
-            # A monitor in Python takes 10 % of a short step, so it is set only if needed.
-            if progress or look is not None or watch.is_needed or ending.signal is not None:
-                simulator.set_monitor(monitor)
-            composed = None
+            simulator.set_monitor(monitor)
             if not config.target_realtime_rate:
                 composed = MergedRun.of(diagram, context, config, duration)
-            is_done = composed is not None and composed.run(start + duration, seen)
-            if not is_done:
+            if composed is None or not composed.run(start + duration, seen):
                 if composed is not None:  # To the failure, whose message the blocks know.
                     simulator.Initialize(NO_EVENTS)
                 simulator.AdvanceTo(start + duration)
@@ -126,9 +115,9 @@ def simulate(
             steps += 0 if composed is None else composed.steps
             elapsed = time.perf_counter() - began
             watch.look(context, is_last=True)
+        except InconsistentStateError:
+            raise  # The start state: its message says what to do.
         except (DrakeDaeError, RuntimeError) as error:
-            if not began and isinstance(error, InconsistentStateError):
-                raise  # The start state: its message says what to do.
             told = watch.explain(error, context)
             if told is error:
                 raise
@@ -183,7 +172,7 @@ class _Progress:
             disable=None if is_shown else True,  # None: without a terminal.
             file=sys.stderr,
             bar_format=form,
-            **default_size(),
+            ncols=79,
         )
         self._began = self._last = time.perf_counter()
 
@@ -201,13 +190,3 @@ class _Progress:
     def close(self) -> None:
         with suppress(OSError):
             self._bar.close()
-
-
-def default_size() -> dict[str, int]:
-    """The size for tqdm if the terminal reports no columns, as in some containers."""
-    try:
-        if os.get_terminal_size(sys.stderr.fileno()).columns > 0:
-            return {}
-    except OSError:
-        pass
-    return {"ncols": 79, "nrows": 24}

@@ -16,6 +16,7 @@ from drake_dae.errors import ReferenceSignalError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.by_name import denoted
 from drake_dae.robots import (
+    LETTERS,
     AxisCoordinates,
     Constraint,
     ConstraintSet,
@@ -142,7 +143,7 @@ class _Search:
                     rows |= zip(letters, self._add(point, "axes"), strict=True)
             self._points.append([rows[axis] for axis in "xyz"])
             column, sign = tool_axis(links, touch)
-            axis = "xyz"[column]
+            axis = LETTERS[column]
             self._outward.append(sign * links.rotation(touch.frame)[:, column])
             if kind != "free":
                 tilt = TiltFromNormalForm(name, axis, "xyz".replace(axis, ""))

@@ -150,7 +150,7 @@ def _checked_constraints(
             bound.place(force)
     each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
     with at("law.control_weights"):
-        choice = robots.control_choice(robot.title, scenario.law.control_weights or None, actuators)
+        choice = robots.control_choice(scenario.law.control_weights or None, actuators)
     parts: tuple[Any, ...] = (links, *constraints, *robot.known_forces, *attached)
     parameters = [p.name for p in (*choice, *(p for part in parts for p in part.parameters))]
     for moving in scenario.exogenous:

@@ -85,7 +85,7 @@ class TiltFromNormalForm:
     """
 
     constraint: str
-    axis: str
+    axis: robots.Letter
     components: str = ""
 
     def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
@@ -234,7 +234,7 @@ _REFERENCES: dict[str, type] = {
 _SURFACES = "Plane Sphere Cylinder Ellipsoid Torus ImplicitSurface MeasuredSurface"
 _CONSTRAINTS = (
     "PointOnSurface WeldedFrames CoincidentPoints FixedDistance JointCoupler RevoluteLoopJoint "
-    "PrismaticLoopJoint AxisNormalToSurface Blade RollingWheel RollingBall"
+    "PrismaticLoopJoint AxisNormalToSurface RollingWheel"
 )
 _OUTPUTS = "PointCoordinates AxisCoordinates SurfaceCoordinates TiltFromNormal JointPositions"
 _PLANTS = "IdealConstraints MultibodyPlant CompliantContact OwnPlant"

@@ -196,7 +196,7 @@ def start_state(
             f"found no configuration near start.positions with {goal} (the references and "
             f"start.errors at the start) on the constraints: {error}"
         ) from error
-    return model.balance.state(q, outputs[count:], parameters)
+    return model.rest_state(q, outputs[count:], parameters)
 
 
 def _within_limits(

@@ -1,25 +1,11 @@
-"""Given states at which a system is analyzed, and the way downhill between random ones."""
+"""The way downhill between the random states at which a system is analyzed."""
 
 import casadi as ca
 import numpy as np
 import pytest
-from problems import PROBLEMS
 
-from drake_dae.analysis import analyze
 from drake_dae.dae import DaeSystem, Manifold
 from drake_dae.dae.samples import Samples
-
-
-def test_given_states():
-    problem = PROBLEMS["pendulum"]()
-    random = np.random.default_rng(0)
-    states = np.array([problem.consistent(random) for _ in range(4)])
-    analysis = analyze(problem.system, states=states)
-    np.testing.assert_allclose(analysis.states, states, atol=1e-12)
-    # These alone, nothing between them.
-    least = min(problem.known(x).control_matrix.item() for x in states)
-    assert analysis.assumptions[4].margin.singular_value == pytest.approx(least, rel=1e-10)
-    assert analysis.where == "4 consistent states as given"
 
 
 def circle() -> Manifold:

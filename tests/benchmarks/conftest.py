@@ -44,4 +44,4 @@ def pytest_terminal_summary(
     terminalreporter: pytest.TerminalReporter, config: pytest.Config
 ) -> None:
     terminalreporter.section("speed: ratios of ours to the counterpart, in one run and alternating")
-    terminalreporter.write_line(Table(HEAD, config.stash.get(LINES, [])).to_markdown())
+    terminalreporter.write_line(str(Table(HEAD, config.stash.get(LINES, []))))

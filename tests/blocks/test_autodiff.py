@@ -14,7 +14,6 @@ from runs import some
 
 import drake_dae as dd
 from drake_dae import poles
-from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, NonFiniteError, SingularityError
 from drake_dae.systems import TrajectoryReference
 
@@ -227,7 +226,7 @@ def assert_poles(loop, context, poles, zeros, tolerance):
     np.testing.assert_array_less(np.abs(found - wanted) / size, tolerance)
 
 
-def resting_loop(model, structure, gains, sensor=None, **force_feedback):
+def resting_loop(model, structure, gains):
     """A loop at rest at its reference, pressing with 20 N, and its context."""
     plant = dd.RobotPlant(model, structure=structure)
     context = plant.CreateDefaultContext()
@@ -237,14 +236,11 @@ def resting_loop(model, structure, gains, sensor=None, **force_feedback):
     outputs = plant.GetOutputPort("controlled_output").Eval(context)
     loop = dd.make_closed_loop(
         plant,
-        dd.TrackingLaw(model.dae, gains, structure=structure, **force_feedback),
+        dd.TrackingLaw(model.dae, gains, structure=structure),
         [dd.ConstantReference(outputs[:-1]), dd.ConstantReference(20.0)],
-        LoopSettings(sensor=sensor),
     )
     whole = loop.diagram.CreateDefaultContext()
     plant.set_state(plant.GetMyMutableContextFromRoot(whole), plant.state(context))
-    if sensor is not None:
-        sensor.set_force(sensor.GetMyMutableContextFromRoot(whole), [20.0])
     return loop, whole
 
 

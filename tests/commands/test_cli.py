@@ -205,23 +205,6 @@ def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, 
     assert capsys.readouterr().err == "error: empty\n"
 
 
-def test_a_rollout_leaves_the_files_of_a_run(tmp_path, capsys):
-    """With fixed steps the record is that of the simulation, to 1e-12 of forces of some 10 N."""
-    steps = ["integrator.integration_scheme=runge_kutta3", "integrator.use_error_control=false"]
-    steps += ["integrator.max_step_size=0.001", "duration=0.05", "write.plots=false"]
-    settings = [text for setting in steps for text in ("--set", setting)]
-    records = []
-    for options in ([], ["--rollout"]):
-        arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--force", *options]
-        assert main([*arguments, *settings, "--set", "write.animation=false"]) == 0
-        records.append(Record.load(tmp_path / "record.npz"))
-        assert len([*tmp_path.iterdir()]) == 3
-    for name in records[0].signals:
-        difference = records[0][name][:49] - records[1][name][:49]
-        assert np.max(np.abs(difference)) < 1e-11
-    assert "50 steps" in capsys.readouterr().out
-
-
 def test_a_shipped_scenario_is_shown_as_it_is_or_where_it_is(capsys):
     assert main(["print", "seven_joint_dome"]) == 0
     assert capsys.readouterr().out == find_scenario("seven_joint_dome").read_text()

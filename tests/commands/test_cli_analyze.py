@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 from runs import TASKS, each_scenario, run, scenario, some
-from scipy.optimize import brentq
 
 from drake_dae import build_scenario
 from drake_dae.analysis import LimitKind
@@ -79,25 +78,6 @@ def test_a_torque_limit_that_is_exceeded(capsys):
     (row,) = [line.split() for line in text.splitlines() if line.startswith("joint1_motor")]
     assert row[1:4] == ["N", "m", f"{torque1:.4g}"]
     assert row[-1] == "300"
-
-
-@pytest.mark.slow
-def test_a_reference_that_leaves_the_workspace(capsys):
-    """Two links of 1 m reach z = 1.6 m on the wall at x = 1.2 m.
-
-    The quintic blend from 0.3 to 3 m in 0.3 s is there when 10 s^3 - 15 s^4 + 6 s^5 = 1.3 / 2.7.
-    """
-    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
-    when = 0.3 * brentq(lambda s: 10 * s**3 - 15 * s**4 + 6 * s**5 - 1.3 / 2.7, 0.0, 1.0)
-    code, text = analyze(capsys, "two_link_wall", "--set", move)
-    assert code == 2
-    words = " ".join(text.split())
-    assert "0.147" in words
-    found = find_feasibility(scenario("two_link_wall", move)).analysis.motion
-    assert found.ending.time == pytest.approx(when, abs=1e-4)
-    assert found.times[-1] < when < found.times[-1] + 0.01
-    # On the way there, exceeded limits are reported as well.
-    assert re.search(r"PROBLEM  joint2_w has .* at 0\.1\S+ s, .* 3 rad/s", text)
 
 
 @pytest.mark.slow

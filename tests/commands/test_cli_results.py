@@ -2,15 +2,10 @@
 
 import json
 
-import numpy as np
 import pytest
 
-from drake_dae import Record, load_scenario
+from drake_dae import Record
 from drake_dae.cli import main
-from drake_dae.running import export as exported
-from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.shipped import find_scenario
-from drake_dae.scenario.start import start_scenario
 from drake_dae.studies.study import FILES
 
 BARE = ("--set=write.plots=false", "--set=write.animation=false")
@@ -62,31 +57,6 @@ def test_a_good_run_is_reported_with_figures_and_files(tmp_path, capsys):
     outputs = {one["name"]: one for one in found["outputs"]}
     assert [*outputs] == [s.name for s in record.signals["tracking_error"].signals]
     assert 0.0 <= max(one["off_prediction"] for one in outputs.values()) < 1e-6
-
-
-@pytest.mark.slow
-def test_all_commands_start_at_the_same_state(tmp_path, monkeypatch):
-    """Also where start.positions are left out, and the robot's default leads elsewhere."""
-    found = {}
-
-    def kept(loop, context, *_):
-        own = loop.plant.GetMyContextFromRoot(context)
-        found["export"] = own.get_continuous_state_vector().CopyToVector()
-        return [tmp_path / "loop.c"]
-
-    monkeypatch.setattr(exported, "export_loop", kept)
-    settings = ["--set=start={}", "--set=duration=0.01", *BARE]
-    assert main(["export", "two_link_wall", *settings, f"--out={tmp_path / 'code'}"]) == 0
-    assert main(["simulate", "two_link_wall", *settings, f"--out={tmp_path / 'run'}"]) == 0
-    first = Record.load(tmp_path / "run" / "record.npz")["state"][0]
-    np.testing.assert_allclose(found["export"], first, atol=1e-9)
-    # And a loop that is started by what it was built from.
-    scenario = load_scenario(find_scenario("two_link_wall"), ["start={}"])
-    _, loop = build_completed(scenario)
-    context = start_scenario(scenario, loop)
-    own = loop.plant.GetMyContextFromRoot(context)
-    state = own.get_continuous_state_vector().CopyToVector()
-    np.testing.assert_allclose(state, first, atol=1e-9)
 
 
 # Of a study.

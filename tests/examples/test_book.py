@@ -5,13 +5,12 @@ import os
 import re
 import subprocess
 from pathlib import Path
-from urllib.parse import quote
 
 import pytest
 from book.generated import public_names, uses
 from book.notebooks import has_code, notebook
 from book.pages import BOOK, PageError, blocks, compare, pages, run_page
-from browser import BUDGET, CHROMIUM, dumped, low_contrast
+from browser import CHROMIUM, low_contrast
 
 SLOW = {
     "explanations/force.md",
@@ -123,22 +122,3 @@ def test_site_is_made_and_loads_nothing_from_outside(tmp_path):
     if CHROMIUM:
         for page in ("index", "how_to/gains", "reference/errors", "tutorials/first_contact"):
             assert low_contrast(tmp_path / "site" / f"{page}.html") == {}, page
-        for question, answer in QUESTIONS.items():
-            assert f"how_to/{answer}.html" in first_of_search(tmp_path / "site", question)
-
-
-QUESTIONS = {
-    "own controller": "own_controller",
-    "contact force in my diagram": "own_controller",
-    "friction": "friction",
-    "controller for embedded": "real_arm",
-    "unknown tool weight force error": "wrong_model",
-}
-"""What a user looks for -> the page that answers it."""
-
-
-def first_of_search(site: Path, question: str) -> list[str]:
-    """The addresses of the first three pages that the search of the site finds."""
-    address = f"{(site / 'search.html').as_uri()}?q={quote(question)}"
-    found = re.findall(r'<li class="kind-\w+"><a href="([^"?#]*)', dumped(address, BUDGET))
-    return list(dict.fromkeys(found))[:3]

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from command_line import QUICK
 
-from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.errors import GeometryWarning
 
@@ -48,22 +47,3 @@ def test_task_is_tracked_as_predicted(task, tmp_path, monkeypatch, capsys):
         assert main(arguments) == 0
     found = json.loads(capsys.readouterr().out)
     assert "prediction" not in [one["kind"] for one in found["findings"]]
-
-
-NEAR = {"deburring", "grinding"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "task",
-    [pytest.param(task, marks=[pytest.mark.thorough] * (task.stem not in NEAR)) for task in TASKS],
-    ids=lambda task: task.stem,
-)
-def test_ideal_contact_is_kept_to_a_nanometre(task, tmp_path, monkeypatch):
-    """With an integrator that is as accurate; a projection follows each of its steps."""
-    find_vendors(task, monkeypatch)
-    accurate = ["--set", "integrator.accuracy=1.0e-10", "--set", "duration=2"]
-    with warnings.catch_warnings(action="ignore", category=GeometryWarning):
-        assert main(["simulate", str(task), "--out", str(tmp_path), *QUICK, *accurate]) == 0
-    record = Record.load(tmp_path / "record.npz")
-    assert abs(record["constraint_residual"]).max() < 1e-9

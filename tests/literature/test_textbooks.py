@@ -3,45 +3,11 @@
 The sources were read where they are published on the web; each test names its own.
 """
 
-import casadi as ca
 import numpy as np
 from arms import error_controlled
 from numpy.testing import assert_allclose
-from pydrake.systems.framework import DiagramBuilder
 
-from drake_dae import (
-    DaePlant,
-    DaeSystem,
-    ExpressionReference,
-    LinkExpressions,
-    ReferenceGenerator,
-    RobotModel,
-    RobotPlant,
-    simulate,
-)
-from drake_dae.robots import Blade
-
-G = 9.81
-NOTHING = np.zeros((3, 0))
-
-
-def flat(mass, about_center, center=0.0, gravity=G):
-    """A body in the x-z plane: its origin, and the angle of its x axis above the horizontal.
-
-    Its center of mass is on its x axis.
-    """
-    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
-    c, s = ca.cos(q[2]), ca.sin(q[2])
-    turned = ca.vertcat(ca.horzcat(c, 0, -s), ca.horzcat(0, 1, 0), ca.horzcat(s, 0, c))
-    lever = mass * center
-    M = ca.blockcat(
-        [[mass, 0, -lever * s], [0, mass, lever * c],
-         [-lever * s, lever * c, about_center + mass * center**2]]
-    )  # fmt: skip
-    spun = -lever * v[2] ** 2
-    H = ca.vertcat(spun * c, spun * s + mass * gravity, lever * gravity * c)
-    links = {"body": (turned, ca.vertcat(q[0], 0, q[1]))}
-    return LinkExpressions(q, v, M, H, links, actuation_matrix=NOTHING)
+from drake_dae import DaePlant, DaeSystem, simulate
 
 
 def test_a_ball_on_a_turntable_goes_round_with_two_sevenths_of_its_rate():
@@ -77,91 +43,3 @@ def test_a_ball_on_a_turntable_goes_round_with_two_sevenths_of_its_rate():
         assert_allclose(plant.state(context)[:2], wanted, atol=1e-9)
     force = plant.GetOutputPort("constraint_force").Eval(context)
     assert_allclose(force, mass * rate * np.array([-speed[1], speed[0]]), atol=1e-9)
-
-
-def test_chaplygins_sleigh_comes_out_of_its_turn_as_a_hyperbolic_tangent():
-    """v' = a w^2, w' = -m a / (I + m a^2) v w: v = c tanh(a c t / k^2), k^2 = (I + m a^2) / m.
-
-    Bloch, Nonholonomic Mechanics and Control, 1.7, as quoted at Mathematica Stack Exchange 162070.
-    With c^2 = v^2 + k^2 w^2, which is the energy, v' = a (c^2 - v^2) / k^2.
-    """
-    mass, about, ahead, spin = 2.0, 0.3, 0.4, 2.5
-    # The plane x-z lies on the ice, where there is no weight.
-    blade = Blade("body", (0, 0, 1))
-    links = flat(mass, about, ahead, gravity=0.0)
-    model = RobotModel(links, [blade], [], [0, 0, 0], "sleigh", forces=[])
-    plant = RobotPlant(model)
-    assert plant.structure.constraint_degrees == (1,)
-    context = plant.CreateDefaultContext()
-    plant.set_state(context, [0, 0, 0, 0, 0, spin])
-    simulate(plant, context, 1.5, error_controlled(1e-12))
-    gyration = (about + mass * ahead**2) / mass
-    energy = np.sqrt(gyration) * spin
-    way = ahead * energy * 1.5 / gyration
-    *_, angle, vx, vz, rate = plant.state(context)
-    assert_allclose(vx * np.cos(angle) + vz * np.sin(angle), energy * np.tanh(way), atol=1e-10)
-    assert_allclose(rate, spin / np.cosh(way), atol=1e-10)
-    # The blade bears m (v w + a w') across.
-    force = plant.GetOutputPort("constraint_force").Eval(context)
-    speed, slowing = energy * np.tanh(way), -ahead / gyration * energy * np.tanh(way) * rate
-    assert_allclose(force, mass * (speed * rate + ahead * slowing), atol=1e-9)
-
-
-MASS, TURN, GRAVITY = 0.7, 1.6, G
-
-
-def bead():
-    """m r'' = m g + v n, 0 = n . r, with the normal n = (-sin a, cos a) of the wire at a(t)."""
-    return DaeSystem.from_functions(
-        ["x", "y", "vx", "vy"],
-        f=lambda s, p: [s[2], s[3], 0.0, -GRAVITY],
-        g=lambda s, p: [0.0, 0.0, -ca.sin(p.angle) / MASS, ca.cos(p.angle) / MASS],
-        k=lambda s, p: -ca.sin(p.angle) * s[0] + ca.cos(p.angle) * s[1],
-        parameters={"angle": 0.0},
-        exogenous=["angle"],
-        name="bead",
-    )
-
-
-def exact(time, place, speed):
-    """s and s' along the wire from s'' = w^2 s - g sin(w t), and the wire's force."""
-    own = GRAVITY / (2 * TURN**2)
-    odd = speed / TURN - own
-    s = place * np.cosh(TURN * time) + odd * np.sinh(TURN * time) + own * np.sin(TURN * time)
-    rate = place * np.sinh(TURN * time) + odd * np.cosh(TURN * time) + own * np.cos(TURN * time)
-    force = MASS * (2 * TURN * TURN * rate + GRAVITY * np.cos(TURN * time))
-    return s, TURN * rate, force
-
-
-def test_a_bead_on_a_wire_that_turns():
-    """A constraint that time drives (Goldstein, Classical Mechanics, chapter 1).
-
-    It goes out to 1.4 m, falls back through the axle, and is at 4 m on the other side at 2.5 s.
-
-    1e-12 in each step leaves 1e-12; the wire's force is m (2 w s' + g cos w t).
-    """
-    plant = DaePlant(bead())
-    assert plant.structure.constraint_degrees == (2,)
-    builder = DiagramBuilder()
-    builder.AddSystem(plant)
-    angle = ExpressionReference(lambda t: TURN * t)
-    source = builder.AddSystem(ReferenceGenerator([angle], plant.exogenous_layout.degrees))
-    builder.Connect(source.get_output_port(), plant.GetInputPort("exogenous"))
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    own = plant.GetMyMutableContextFromRoot(context)
-    place, speed = 0.2, 2.6
-    plant.set_state(own, [place, 0.0, speed, TURN * place])
-    for time in (0.5, 1.5, 2.5):
-        config = error_controlled(1e-12)
-        config.start_time = context.get_time()
-        simulate(diagram, context, time - context.get_time(), config)
-        s, rate, force = exact(time, place, speed)
-        along = np.array([np.cos(TURN * time), np.sin(TURN * time)])
-        across = np.array([-along[1], along[0]])
-        state = plant.state(own)
-        assert_allclose(state[:2], s * along, rtol=1e-11, atol=1e-11)
-        assert_allclose(state[2:], rate * along + TURN * s * across, rtol=1e-11, atol=1e-11)
-        found = plant.GetOutputPort("constraint_force").Eval(own)
-        assert_allclose(found, force, rtol=1e-10)
-    assert s < -3.0

@@ -34,16 +34,13 @@ from drake_dae import (
     PrismaticLoopJoint,
     RevoluteLoopJoint,
     RollingWheel,
-    Sphere,
 )
 from drake_dae.errors import ModelError
 from drake_dae.robots import (
-    Blade,
     Constraint,
     ConstraintSet,
     LoopState,
     MultibodyExpressions,
-    RollingBall,
     WeldedFrames,
 )
 from drake_dae.trace.functions import TracedFunction
@@ -73,11 +70,6 @@ Q = np.zeros(8)
 
 def plane_at(place, _):
     return PointOnSurface("tip", Plane(tuple(place @ POINT), (1.0, 2.0, -2.0)), POINT, "plane")
-
-
-def ball_at(place, _):
-    center = place @ np.array(POINT) + [0.0, 0.3, 0.4]
-    return PointOnSurface("tip", Sphere(tuple(center), 0.5, inside=True), POINT, "ball")
 
 
 def frictional_at(place, _):
@@ -121,7 +113,7 @@ def turning(place, base, turn, **options):
 
 
 def turning_at(place, base):
-    return turning(place, base, 2.5, damping=0.3, stiffness=2.0, rest=1.5, lower=1.0, upper=4.0)
+    return turning(place, base, 2.5, damping=0.3, stiffness=2.0, rest=1.5, lower=1.0, upper=3.0)
 
 
 def turning_in_a_plane_at(place, base):
@@ -148,31 +140,8 @@ def rod_at(place, base):
     return FixedDistance("base", other, "tip", POINT, float(length))
 
 
-def blade_at(place, _):
-    return Blade("tip", (1.0, 2.0, 0.0), POINT)
-
-
 def wheel_at(place, _):
     return RollingWheel("tip", 0.2, (0.1, 1.0, 0.2), POINT, (0.1, -0.2, 0.9))
-
-
-def rolling_at(place, _):
-    """Inside a sphere of radius 0.5 m, the ball's center 0.3 m from its center."""
-    center = place @ np.array(POINT) + [0.1, 0.2, 0.2]
-    return RollingBall("tip", Sphere(tuple(center), 0.5, inside=True), 0.2, POINT)
-
-
-def flat_at(place, _):
-    """The tip's own axis (0, 3, 4) is the normal of a plane somewhere."""
-    normal = place.rotation() @ np.array([0.0, 0.6, 0.8])
-    return AxisNormalToSurface("tip", Plane((1.0, 2.0, 3.0), tuple(normal)), (0.0, 3.0, 4.0), POINT)
-
-
-def upright_at(place, _):
-    """The tip's own axis (0, 3, 4) points away from the center of a ball that it does not touch."""
-    normal = place.rotation() @ np.array([0.0, 0.6, 0.8])
-    center = place @ np.array(POINT) - 0.9 * normal
-    return AxisNormalToSurface("tip", Sphere(tuple(center), 0.5), (0.0, 3.0, 4.0), POINT, "up")
 
 
 def tilted_at(place, base):
@@ -197,7 +166,6 @@ def mirror_at(place, base):
 # How to make it where the robot is, and the frames that its forces act on.
 MEMBERS = {
     "plane": (plane_at, {"tip", "world"}),
-    "ball": (ball_at, {"tip", "world"}),
     "saddle": (saddle_at, {"tip", "world"}),
     "pin": (pin_at, {"tip", "base"}),
     "weld": (weld_at, {"tip", "base"}),
@@ -207,11 +175,7 @@ MEMBERS = {
     "rod": (rod_at, {"tip", "base"}),
     "frictional": (frictional_at, {"tip", "world"}),
     "rough": (rough_at, {"tip", "world"}),
-    "blade": (blade_at, {"tip", "world"}),
     "wheel": (wheel_at, {"tip", "world"}),
-    "rolling": (rolling_at, {"tip", "world"}),
-    "flat": (flat_at, {"tip", "world"}),
-    "upright": (upright_at, {"tip", "world"}),
     "tilted": (tilted_at, {"tip", "world"}),
     "coupler": (coupler_at, {"rider", "link", "base"}),
     "mirror": (mirror_at, set()),
@@ -441,7 +405,7 @@ def test_a_push_drives_the_residual_up():
         up = rows.reshape(-1) @ np.linalg.solve(links.plant.CalcMassMatrix(context), columns)
         assert up > 0.0
     rough = {"frictional", "rough"}
-    assert found == {"plane", "ball", "saddle", "rolling", *rough}
+    assert found == {"plane", "saddle", *rough}
 
 
 def pole():

@@ -56,9 +56,7 @@ def sled():
     bias = ca.vertcat(-2.0 * v[1] * v[2], 2.0 * v[0] * v[2], 0.0)
     pose = (turned(q[2]), ca.vertcat(q[0], q[1], 0.5))
     mass = ca.diag(ca.SX([2.0, 2.0, 0.3]))
-    return LinkExpressions(
-        q, v, mass, bias, frames={"tool": pose}, velocity_map=turned(q[2]), gear_ratios=[2, 3, 4]
-    )
+    return LinkExpressions(q, v, mass, bias, frames={"tool": pose}, velocity_map=turned(q[2]))
 
 
 def floating():

@@ -237,11 +237,6 @@ class Pressed(ForceOutput):
             lambda: ForceCombination({"grip1.fx": 1.0, "gear.moment": 1.0}, "a").signals(bound()),
             "'a'",
         ),
-        (lambda: as_force_outputs(["grip1.fx", "grip1.fx"], bound()), r"grip1\.fx"),
-        (
-            lambda: as_force_outputs([Squeeze("object", "grip1", "grip2")] * 2, bound()),
-            r"grip1\.grip2\.squeeze",
-        ),
         (lambda: force_rows([Pressed()], bound(), robot().links), "pressed"),
     ],
 )

@@ -17,35 +17,25 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.systems import PointMaterial
 
 
-def pushed(exogenous=(), frame="tool", actuation=()):
-    """The two-link arm on its wall with a known force on its tool."""
+def loaded(*loads, touches=True):
+    """The two-link arm, on its wall or free, with loads."""
     known = arm("two_link").model
-    load = KnownForce(frame, (0.05, 0.0, 0.1), name="push")
-    return RobotModel.from_multibody(
-        parse("two_link_arm"),
-        known.constraints,
-        known.outputs,
-        [1.2, -1.6],
-        actuation=actuation,
-        exogenous=exogenous,
-        known_forces=[load],
-    )
+    parts = (known.constraints, known.outputs) if touches else ((), ())
+    return RobotModel.from_multibody(parse("two_link_arm"), *parts, [1.2, -1.6], known_forces=loads)
 
 
-def test_a_force_acts_as_drake_applies_it():
-    """v' of a free arm with the same force as an ExternallyAppliedSpatialForce: round-off."""
-    known = arm("two_link").model
-    model = RobotModel.from_multibody(
-        parse("two_link_arm"),
-        [],
-        known.outputs[:0],
-        [1.2, -1.6],
-        known_forces=pushed().known_forces,
-    )
-    plant, drake = RobotPlant(model), parse("two_link_arm")
+@pytest.mark.parametrize("kind", [KnownForce, KnownWrench])
+def test_a_load_acts_as_drake_applies_it(kind):
+    """v' of a free arm with the same load as an ExternallyAppliedSpatialForce: round-off."""
+    lever = np.array([0.05, 0.0, 0.1])
+    plant = RobotPlant(loaded(kind("tool", tuple(lever), name="push"), touches=False))
+    drake = parse("two_link_arm")
     force, state = np.array([3.0, -2.0, 7.0]), np.array([0.3, -1.1, 0.4, 0.7])
+    moment = np.array([2.0, -5.0, 1.0]) if kind is KnownWrench else np.zeros(3)
     context = plant.CreateDefaultContext()
     plant.set_parameter(context, "push.force", force)
+    if kind is KnownWrench:
+        plant.set_parameter(context, "push.moment", moment)
     plant.set_state(context, state)
     plant.GetInputPort("control").FixValue(context, [1.0, -2.0])
 
@@ -55,8 +45,8 @@ def test_a_force_acts_as_drake_applies_it():
     frame = drake.GetFrameByName("tool")
     applied = ExternallyAppliedSpatialForce()
     applied.body_index = frame.body().index()
-    applied.p_BoBq_B = frame.GetFixedPoseInBodyFrame() @ np.array([0.05, 0.0, 0.1])
-    applied.F_Bq_W = SpatialForce(np.zeros(3), force)
+    applied.p_BoBq_B = frame.GetFixedPoseInBodyFrame() @ lever
+    applied.F_Bq_W = SpatialForce(moment, force)
     drake.get_applied_spatial_force_input_port().FixValue(own, [applied])
     assert_allclose(
         plant.EvalTimeDerivatives(context).CopyToVector(),
@@ -65,38 +55,9 @@ def test_a_force_acts_as_drake_applies_it():
     )
 
 
-def test_a_wrench_acts_as_a_force_at_another_point_of_the_link():
-    """v' of the arm on its wall: round-off."""
-    known, levers = arm("two_link").model, (np.zeros(3), np.array([0.05, 0.0, 0.1]))
-    force, state = np.array([3.0, -2.0, 7.0]), known.configuration([0.3], [1.2, -1.6])
-    found = []
-    for lever, kind in zip(levers, (KnownWrench, KnownForce), strict=True):
-        load = kind("tool", lever, name="push")
-        model = RobotModel.from_multibody(
-            parse("two_link_arm"),
-            known.constraints,
-            known.outputs,
-            [1.2, -1.6],
-            known_forces=[load],
-        )
-        plant = RobotPlant(model)
-        context = plant.CreateDefaultContext()
-        plant.set_parameter(context, "push.force", force)
-        if kind is KnownWrench:
-            rotation = model.links.rotation("tool")
-            turned = ca.Function("R", [model.links.q], [rotation])(state).full()
-            plant.set_parameter(context, "push.moment", np.cross(turned @ levers[1], force))
-        plant.set_state(context, [*state, 0.0, 0.0])
-        plant.GetInputPort("control").FixValue(context, [1.0, -2.0])
-        rate = plant.EvalTimeDerivatives(context).CopyToVector()
-        found.append(np.append(rate, plant.GetOutputPort("constraint_force").Eval(context)))
-    assert_allclose(found[0], found[1], rtol=1e-11, atol=1e-12)
-    assert np.abs(found[0]).max() > 0.1
-
-
 def test_frames_that_are_not_there_are_named():
     with pytest.raises(ModelError, match="'tol'"):
-        pushed(frame="tol")
+        loaded(KnownForce("tol"))
     settings = ["robot.known_forces=[{frame: tol}]"]
     with pytest.raises(ScenarioError, match=r"robot.known_forces.0: .*'tol'"):
         build_scenario(load_scenario(find_scenario("two_link_wall"), settings))
@@ -107,11 +68,7 @@ COULOMB, VISCOUS, SLOW = np.array([3.0, 0.5]), np.array([0.2, 0.1]), 0.01
 
 def with_joint_friction(**more):
     """The two-link arm on its wall, with friction in its joints."""
-    known = arm("two_link").model
-    joints = JointFriction(["joint1", "joint2"], **more)
-    return RobotModel.from_multibody(
-        parse("two_link_arm"), known.constraints, known.outputs, [1.2, -1.6], known_forces=[joints]
-    )
+    return loaded(JointFriction(["joint1", "joint2"], **more))
 
 
 def added(model, velocities):
@@ -167,12 +124,5 @@ def test_a_discrete_plant_takes_friction_implicitly():
     ],
 )
 def test_friction_that_makes_no_sense_is_refused(joints, more, message):
-    known = arm("two_link").model
     with pytest.raises(ModelError, match=message):
-        RobotModel.from_multibody(
-            parse("two_link_arm"),
-            known.constraints,
-            known.outputs,
-            [1.2, -1.6],
-            known_forces=[JointFriction(joints, **more)],
-        )
+        loaded(JointFriction(joints, **more))

@@ -7,7 +7,6 @@ Drake's, with the damping, spring, limits and motor that it had.
 
 from functools import cache
 
-import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -203,22 +202,6 @@ def test_what_the_loop_joint_exerts_is_what_drakes_joint_does(cut):
     for name, value in found.items():
         assert value == pytest.approx(by_drake[name.split(".")[1]], rel=1e-9, abs=1e-9)
     assert len(found) == 5
-
-
-def test_the_angle_counts_from_the_middle_of_its_limits():
-    """In a chain that is closed by nothing else: 3 rad beyond a middle of 2 is 5, and not -1.28."""
-    loop = RevoluteLoopJoint("world", "link1", "z", lower=0.0, upper=4.0, damping=1.0)
-    plant = MultibodyPlant(0.0)
-    body = plant.AddRigidBody("link1", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
-    plant.AddJoint(
-        RevoluteJoint("turn", plant.world_frame(), body.body_frame(), np.array([0.0, 0.0, 1.0]))
-    )
-    plant.Finalize()
-    model = RobotModel.from_multibody(plant, [], [])
-    angle = ca.Function("c", [model.links.q], [loop.coordinates(model.links)])
-    for value in (-1.0, 0.5, 3.0, 5.0):
-        assert float(angle(value)) == pytest.approx(value, abs=1e-14)
-    assert float(angle(5.2)) == pytest.approx(5.2 - 2.0 * np.pi, abs=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RpyFloatingJoint, SpatialInertia
-from pydrake.systems.analysis import Simulator
 from vendors import joint, link, robot
 
 from drake_dae import (
@@ -27,8 +26,6 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     Signal,
-    Sphere,
-    SurfaceCoordinates,
     TrackingLaw,
     WeldedFrames,
     find_structure,
@@ -98,36 +95,6 @@ def test_names_and_units():
     )
 
 
-def test_surface_coordinates_and_expressions():
-    """On a sphere around the shoulder the longitude about y is an angle of the tip."""
-    ball = PointOnSurface("tool", Sphere((0, 0, 0), 1.5, axis=(0, 1, 0)), name="ball")
-    angle = ExpressionOutput(
-        lambda links: ca.atan2(links.position("tool")[2], links.position("tool")[0]),
-        [Signal("angle", "rad")],
-    )
-    model = RobotModel(textbook_links(), [ball], [angle], [1.2, -1.6])
-    structure = find_structure(model.dae)
-    assert structure.output_degrees == (2, 0)
-    state = structure.states[1]
-    both = ca.vertcat(
-        SurfaceCoordinates(ball).expression(model.links), angle.expression(model.links)
-    )
-    longitude, latitude, direct = TracedFunction(
-        "angles", {"q": model.links.q, "p": model.dae.parameter_symbol}, {"angles": both}
-    )(state[:2], model.dae.parameter_values)[0]
-    assert latitude == pytest.approx(0.0, abs=1e-12)
-    # Longitude counts from another direction of the same plane, either way round.
-    slopes = TracedFunction(
-        "slopes",
-        {"q": model.links.q, "p": model.dae.parameter_symbol},
-        {"slopes": ca.jacobian(both, model.links.q)},
-    )(state[:2], model.dae.parameter_values)[0]
-    np.testing.assert_allclose(np.abs(slopes[0]), np.abs(slopes[2]), rtol=1e-10)
-    assert np.isfinite([longitude, direct]).all()
-    names = [s.name for s in SurfaceCoordinates(ball).signals(model.links)]
-    assert names == ["ball.longitude", "ball.latitude"]
-
-
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
 def test_configuration_inverts_the_outputs(name):
     """q = psi(z_1) of (58), checked by MultibodyPlant's own outputs."""
@@ -182,8 +149,6 @@ def test_two_motors_on_one_joint_share_its_torque_by_their_weights():
         (lambda: textbook(mass_matrix=ca.DM([[1, 2], [2, 1]])), "M.q."),
         (lambda: textbook(mass_matrix=ca.DM.eye(3)), r"mass_matrix.*\(3, 3\)"),
         (lambda: textbook(actuation_matrix=np.eye(3)), r"actuation_matrix.*\(3, 3\)"),
-        (lambda: textbook(position_limits=([0.0], [1.0])), r"position_limits.*\(2,\)"),
-        (lambda: textbook(velocity_limits=([1, 1], [1, 2])), "velocity_limits"),
         (lambda: textbook(constraints=[WALL, WALL], outputs=[]), "wall"),
         (lambda: textbook(outputs=[ExpressionOutput(lambda links: links.q, [Signal("a")])]), "2"),
     ],
@@ -283,30 +248,6 @@ def swinging() -> MultibodyPlant:
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base"))
     plant.Finalize()
     return plant
-
-
-def test_it_needs_no_word_about_forces():
-    """It falls from rest, and its energy stays: contacts do no work. The steps leave 1e-6 J."""
-    touching = [PointOnSurface("three", one, name=f"c{k}") for k, one in enumerate(SURFACES)]
-    drakes = swinging()
-    model = RobotModel.from_multibody(drakes, touching, [], [0.6, 0.3, 0.4])
-    assert model.dae.num_outputs == 0
-    assert model.forces == ()
-    plant = RobotPlant(model)
-    context = plant.CreateDefaultContext()
-    q = model.configuration(None, [0.6, 0.3, 0.4])
-    plant.set_consistent_state(context, model.rest_state(q, []))
-    simulator = Simulator(plant, context)
-    simulator.get_mutable_integrator().set_target_accuracy(1e-8)
-    energies = []
-    for time in (0.0, 0.2):
-        simulator.AdvanceTo(time)
-        own = drakes.CreateDefaultContext()
-        drakes.SetPositionsAndVelocities(own, plant.state(context))
-        kinetic, potential = drakes.CalcKineticEnergy(own), drakes.CalcPotentialEnergy(own)
-        energies.append(kinetic + potential)
-    assert kinetic > 1e-3
-    assert energies[1] == pytest.approx(energies[0], abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -26,13 +26,14 @@ from drake_dae import (
     RobotPlant,
     SinusoidReference,
     TrackingLaw,
-    analyze,
+    find_structure,
     make_closed_loop,
     poles,
     simulate,
 )
 from drake_dae.dae import Parameter, Signal, UnilateralInput
 from drake_dae.dae.contacts import Contacts, critical_factor
+from drake_dae.dae.margins import ContactMargins
 from drake_dae.errors import PainleveError
 from drake_dae.trace.functions import TracedFunction
 
@@ -88,10 +89,11 @@ def context_of(plant, state):
 
 @pytest.mark.parametrize("angle", some([0.3, 0.8, 1.0, 1.4], of=3))
 @pytest.mark.parametrize("friction", [0.0, 0.8])
-def test_analyze_finds_the_critical_coefficient_at_a_state(angle, friction):
+def test_the_margin_has_the_critical_coefficient_at_a_state(angle, friction):
     """mu_crit in closed form; s is 1 except for (v_s / v)^2 / 2 = 1e-7. Without friction, too."""
     system = rod(friction).dae
-    found = analyze(system, states=[sliding(angle)]).contact_margin
+    margins = ContactMargins(system, find_structure(system).elimination.constraint_matrix)
+    found = margins.at(sliding(angle), system.parameter_values)
     assert found.critical_friction["floor.friction"] == pytest.approx(critical(angle), rel=1e-6)
     assert found.reserve == pytest.approx(margin_of(friction, angle), abs=1e-6)
     assert not found.is_paradoxical

@@ -1,4 +1,4 @@
-"""Blades, wheels and balls against MultibodyPlant, and against equations worked out by hand."""
+"""Wheels against MultibodyPlant, and against equations worked out by hand."""
 
 from functools import cache
 
@@ -16,18 +16,8 @@ from pydrake.multibody.tree import (
 )
 from test_contract_of_constraints import robot
 
-from drake_dae import (
-    Ellipsoid,
-    Plane,
-    PointCoordinates,
-    RobotModel,
-    RobotPlant,
-    RollingWheel,
-    Sphere,
-    find_structure,
-)
+from drake_dae import PointCoordinates, RobotModel, RobotPlant, RollingWheel, find_structure
 from drake_dae.errors import ModelError
-from drake_dae.robots import Blade, RollingBall
 from drake_dae.trace.functions import TracedFunction
 
 # A robot with two driven wheels, on a planar joint: two wheels roll, one of them holds the side.
@@ -137,16 +127,13 @@ def test_rates_are_velocities_of_the_points_that_touch():
     )
     up = up / np.linalg.norm(up)
     wheel = RollingWheel("tip", radius, tuple(axle), tuple(center), tuple(up))
-    blade = Blade("tip", point=tuple(center))  # Across the frame's y axis.
-    bowl = Sphere((0.1, 0.2, -0.3), 2.0, inside=True)
-    ball = RollingBall("tip", bowl, radius, tuple(center))
     kinematics = links.kinematics()
-    rates = [kinematics.value(c.rate(kinematics)) for c in (wheel, blade, ball)]
-    parameters = [*links.parameters, *wheel.parameters, *ball.parameters]
+    rate = kinematics.value(wheel.rate(kinematics))
+    parameters = [*links.parameters, *wheel.parameters]
     function = TracedFunction(
         "rates",
         {"q": links.q, "v": links.v, "p": ca.vertcat(*[p.symbol for p in parameters])},
-        {name: rate for name, rate in zip(("wheel", "blade", "ball"), rates, strict=True)},
+        {"rate": rate},
     )
     values = np.concatenate([p.value for p in parameters])
     context = plant.CreateDefaultContext()
@@ -172,26 +159,8 @@ def test_rates_are_velocities_of_the_points_that_touch():
         slip = velocity(contact)
         expected = [heading @ slip, np.cross(up, heading) @ slip]
         np.testing.assert_allclose(found[0], expected, atol=1e-12)
-        side = pose.rotation().matrix()[:, 1]
-        np.testing.assert_allclose(found[1], [side @ velocity(middle)], atol=1e-12)
-        inward = np.array(bowl.center) - middle
-        inward /= np.linalg.norm(inward)
-        slip = velocity(middle - radius * inward)
-        first = np.array([1.0, 0.0, 0.0]) - inward[0] * inward
-        first /= np.linalg.norm(first)
-        expected = [inward @ slip, first @ slip, np.cross(inward, first) @ slip]
-        np.testing.assert_allclose(found[2], expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: Blade("a", (0, 0, 0)), "axis"),
-        (lambda: RollingWheel("a", 0.0), r"'wheel\.radius'"),
-        (lambda: RollingBall("a", Plane((0, 0, 0), (0, 0, 1)), -1.0), r"'ball\.radius'"),
-        (lambda: RollingBall("a", Ellipsoid((0, 0, 0), (1, 2, 3)), 0.1), "Ellipsoid"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(make, words):
-    with pytest.raises(ModelError, match=words):
-        make()
+def test_a_wheel_without_radius_is_refused():
+    with pytest.raises(ModelError, match=r"'wheel\.radius'"):
+        RollingWheel("a", 0.0)

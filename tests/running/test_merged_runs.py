@@ -1,7 +1,5 @@
 """Runs of a diagram whose traced blocks are composed to one, beside the diagram as wired."""
 
-import os
-import signal
 from copy import deepcopy
 from functools import cache
 
@@ -189,16 +187,3 @@ def test_drake_goes_on_from_samples_that_fail(short_runs, monkeypatch):
     found, right = loop.record(context), loop.record(expected)
     assert_array_equal(found.time, right.time)
     assert_allclose(found["state"], right["state"], rtol=0, atol=1e-9)
-
-
-def test_a_signal_ends_it_and_keeps_what_it_recorded(short_runs):
-    chosen, loop, context = built("observer and integrals")
-
-    def interrupt(now):
-        if now.get_time() > 0.1:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    run = simulate(loop.diagram, context, 5.0, chosen.integrator, look=interrupt)
-    assert run.interrupted is signal.SIGINT
-    assert 0.1 < context.get_time() < 0.2
-    assert loop.record(context).time[-1] == context.get_time()

@@ -9,7 +9,6 @@ from drake_dae import build_scenario
 from drake_dae.blocks.compose import Leaves
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.scenario import build_commanded
-from drake_dae.scenario.shipped import shipped_scenarios
 
 FIXED = SimulatorConfig(
     integration_scheme="runge_kutta5", use_error_control=False, max_step_size=0.002
@@ -69,21 +68,3 @@ def test_errors_stay_as_predicted_whatever_is_commanded(name):
     moved = found["exogenous"][-1, 0] - found["exogenous"][0, 0]
     assert moved == pytest.approx(-0.06, abs=1e-4)
     assert np.abs(found["constraint_residual"]).max() <= 1e-6
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", shipped_scenarios())
-def test_every_shipped_scenario_is_commanded(name):
-    given = scenario(name)
-    if given.plant.carries:
-        return  # Drake's own contact.
-    built = build_commanded(given)
-    names = parameter_names(built.loop)
-    # What is left out has a reason, of which none is an error of the build.
-    assert all(": none, since " in sentence for sentence in built.left_out)
-    parts = {sentence.partition(":")[0] for sentence in built.left_out}
-    assert any(".push." in each for each in names)
-    assert "links that are pushed" not in parts
-    is_ideal = given.plant.material is None
-    is_held = is_ideal and (given.task or given.estimator) is not None
-    assert ("surfaces that are dragged" in parts) is is_held

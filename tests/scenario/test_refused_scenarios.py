@@ -59,10 +59,10 @@ LINE, GENTLE = (
 )
 DWELL = "!Dwell {name: away, until: [{of: signal, name: go, above: 0.5}]}"
 ENCODERS = "sensors.encoders={position_noise: 1.0e-5}", "estimator={rate: 60, state_rate: 200}"
-DOME = "constraints.0.surface=!Ellipsoid {center: [0, 0, -2], semi_axes: [1, 2, 2]}"
 # Scenario -> its settings -> parts of the message, between which "|" stands.
 REFUSED = {
     "two_link_wall": {
+        "forces=[wall]": "forces.0: |'wall'|wall.force",
         # Settings and the run.
         "duration": "--set duration: ",
         "duration=[1": "duration: |line 1: ",
@@ -141,11 +141,6 @@ REFUSED = {
         "exogenous={plate.rpy: []}": "plate.rpy: |3|0",
     },
     "rod": {"constraints.0.length=0": "constraints.0: |'rod.length'"},
-    "ball": {
-        "forces=null": "outputs: |3",
-        "forces=[dome]": "forces.0: |'dome'|dome.force",
-        DOME: "constraints.0: |Ellipsoid",
-    },
     "task": {
         "task.phases=[]": "task: ",
         "task.phases.0.speed=-1": "task.phases.0: |speed|-1",

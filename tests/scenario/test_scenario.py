@@ -13,7 +13,6 @@ from two_arms import GRASP
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.references import PathLimits
-from drake_dae.robots import Blade, RollingBall
 from drake_dae.scenario import parts as forms
 from drake_dae.scenario.robot_file.robot import Pose, Robot
 from drake_dae.scenario.scenario import (
@@ -48,9 +47,7 @@ def test_every_form_reads_back_equal(tmp_path):
             dd.FixedDistance("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), 1 / 3, "r"),
             dd.JointCoupler("a", "b", -1 / 3, 0.1, "m", "j"),
             dd.AxisNormalToSurface("a", surfaces[3], (0.0, 0.6, -0.8), (0.1, 0.2, 0.3), "n"),
-            Blade("a", (0.0, 0.6, 0.8), (0.1, 0.2, 0.3), "e"),
             dd.RollingWheel("a", 0.1, (1, 0, 0), (0.1, 0.2, 0.3), (0, 1, 0), False, "l"),
-            RollingBall("a", surfaces[1], 0.1, (0.1, 0.2, 0.3), (0, 1, 0), "o"),
         ],
         outputs=[
             dd.PointCoordinates("yes", "xy"),

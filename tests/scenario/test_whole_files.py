@@ -119,21 +119,6 @@ def test_a_rod_keeps_its_length(tmp_path):
         assert np.linalg.norm(place - [1.6, 0, 0]) == pytest.approx(0.7, abs=1e-8)
 
 
-# A ball that spins freely has zero dynamics with eigenvalues 0 in pairs: round-off takes sides.
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::drake_dae.errors.NonMinimumPhaseWarning")
-def test_a_ball_rolls_on_a_dome(tmp_path):
-    """Its point in contact is on the dome, and stands still."""
-    loop, record = held(tmp_path, "ball")
-    assert names(record, "tracking_error") == ["ball.x", "ball.y", "dome.force"]
-    for plant, context in postures(loop, record):
-        ball = plant.GetFrameByName("ball")
-        center = ball.CalcPoseInWorld(context).translation() - [0.0, 0.0, -2.0]
-        distance, moving = np.linalg.norm(center), ball.CalcSpatialVelocityInWorld(context)
-        slip = moving.translational() + np.cross(moving.rotational(), -0.15 * center / distance)
-        np.testing.assert_allclose([distance - 2.15, *slip], 0.0, atol=1e-8)
-
-
 PRESS = """
 robot: {file: press.sdf}
 outputs: [!JointPositions {joints: [motor]}]

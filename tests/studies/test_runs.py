@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 from runs import run_scenario, scenario, some
 
-from drake_dae import build_scenario
 from drake_dae.analysis import robot_limits
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.build import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
-from drake_dae.scenario.start import start_scenario
 from drake_dae.studies.study import Outcome, figures_of
 from drake_dae.studies.sweep import Runner, structure_of
 
@@ -176,22 +173,3 @@ def test_what_no_rollout_has_is_reported():
     Runner(base).check({})
     with pytest.raises(ScenarioError, match="Simulator"):
         Runner(base, 1.0).check({})
-
-
-@pytest.mark.slow
-def test_a_rollout_is_that_of_the_scenario_alone():
-    """On the contact that rollouts have in place of Drake's, and with its noise."""
-    settings = (
-        "plant=!MultibodyPlant {time_step: 1.0e-3, friction: 0.1}",
-        "sampling={period: 1.0e-3, delay: 1.0e-3}",
-        "sensors.force={sample_period: 1.0e-3, noise_deviation: 0.1}",
-    )
-    chosen = scenario("two_link_wall", *settings, "duration=0.1", "compiled=false")
-    result = Runner(scenario_data(chosen), 0.1).run({"plant.friction": 0.2})
-    rolled = for_rollout(read_scenario(varied_data(scenario_data(chosen), {"plant.friction": 0.2})))
-    loop, _ = build_scenario(rolled[0])
-    rollout = roll_scenario(rolled[0], loop, start_scenario(rolled[0], loop))
-    limits = robot_limits(loop.plant.model)
-    ranges = limits.ranges(rollout.record.time, limits.of_record(rollout.record))
-    wanted = figures_of(rollout.record, ranges)
-    assert result.figures == {**wanted, "steps": float(rollout.steps)}

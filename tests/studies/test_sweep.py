@@ -149,31 +149,6 @@ def worker_of(process):
     return int(subprocess.run(call, check=True, capture_output=True, text=True).stdout)
 
 
-@pytest.mark.slow
-@pytest.mark.thorough
-def test_killed_in_the_middle_it_continues_there_to_the_same_table(study, tmp_path):
-    folder, file = tmp_path / "study", tmp_path / "study" / "runs.db"
-    call = command(folder)
-    for wanted in (2, 4):
-        process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        wait_for(wanted, file, process)
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-    assert 4 <= lines(file) < COUNT
-    done = subprocess.run(call, check=True, capture_output=True, text=True)
-    assert lines(file) == COUNT
-    assert done.stdout.startswith(f"{COUNT} runs: {COUNT} finished\n")
-    assert dd.sweep(chosen(), VARIATIONS, file).table() == study.table()
-    with pytest.raises(ModelError, match="rollout"):
-        dd.sweep(chosen(), VARIATIONS, file, rollout=True)
-    with open(folder / "runs.csv", newline="", encoding="utf-8") as table:
-        head, *rows = csv.reader(table)
-    assert head == list(study.table())
-    assert [row[0] for row in rows] == [str(run) for run in range(COUNT)]
-    errors = [float(row[head.index("largest error of tool.z [m]")]) for row in rows]
-    np.testing.assert_array_equal(errors, study.values("largest error of tool.z [m]"))
-
-
 @pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.slow
 def test_ctrl_c_keeps_what_has_ended(tmp_path):

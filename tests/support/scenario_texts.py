@@ -65,13 +65,6 @@ duration: 1.0
 """
 
 
-BALL = """<mujoco model="ball"><compiler angle="radian"/><worldbody>
-<body name="ball" pos="0 0 0.15">
-<joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
-<joint name="z" type="slide" axis="0 0 1"/><joint name="turn_x" type="hinge" axis="1 0 0"/>
-<joint name="turn_y" type="hinge" axis="0 1 0"/><joint name="turn_z" type="hinge" axis="0 0 1"/>
-<geom type="sphere" size="0.15" mass="1"/></body></worldbody>
-<actuator><motor joint="x"/><motor joint="y"/><motor joint="z"/></actuator></mujoco>"""
 TWO_LINK = "robot: {file: package://drake_dae_models/two_link_arm.urdf}"
 
 ROD = f"""{TWO_LINK}
@@ -89,23 +82,6 @@ references:
   tool.z: !Sinusoids {{offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}}
   rod.thrust: 30.0
 start: {{positions: {{joint1: 1.2, joint2: -1.6}}, errors: {{tool.z: 0.02}}}}
-"""
-MARBLE = """robot: {file: ball.xml}
-constraints:
-- !RollingBall
-  frame: ball
-  surface: !Sphere {center: [0, 0, -2], radius: 2}
-  radius: 0.15
-  name: dome
-outputs: [!PointCoordinates {frame: ball, axes: xy}]
-forces: [dome.force]
-law:
-  gains: !Poles {all: [-4.0]}
-references:
-  ball.x: !Sinusoids {offset: 0.0, amplitudes: [0.2], frequencies: [1.0]}
-  ball.y: 0.1
-  dome.force: 25.0
-start: {errors: {ball.x: 0.03}}
 """
 END = """duration: 0.5
 integrator: {integration_scheme: runge_kutta5, accuracy: 1.0e-8, use_error_control: true}
@@ -149,13 +125,12 @@ SHORT = task_text("""
   - !Press {force: 10, over: 0.1}
   - !Move {references: {tool.z: 0.31, wall.force: 12}, duration: 0.2, over: 0.2}
 """)
-TEXTS = {"rod": ROD + END, "ball": MARBLE + END, "task": SHORT, "observed_task": OBSERVED}
+TEXTS = {"rod": ROD + END, "task": SHORT, "observed_task": OBSERVED}
 
 
 def written(name, folder):
-    """A text of `TEXTS` as a file in a folder, with its robot; a shipped scenario's own file."""
+    """A text of `TEXTS` as a file in a folder; a shipped scenario's own file."""
     if name not in TEXTS:
         return find_scenario(name)
-    (folder / "ball.xml").write_text(BALL)
     (folder / f"{name}.yaml").write_text(TEXTS[name])
     return folder / f"{name}.yaml"

@@ -11,9 +11,8 @@ from drake_dae import AxisCoordinates, JointPositions, PointCoordinates, RobotMo
 from drake_dae.robots import Stage
 from drake_dae.scenario.shipped import FOLDER
 
-APART = 1.8
 LENGTH = 0.2
-"""Of the bases and of the object, in m, as in two_arms.dmd.yaml and held_box.urdf."""
+"""Of the object, in m, as in held_box.urdf."""
 
 NOMINAL = np.tile([0.0, -0.7162933, 0.0, -1.7685105, 0.0, 0.9140075, 0.0], 2)
 """Both elbows up, the object level, 0.4 m above the floor, midway between the bases."""

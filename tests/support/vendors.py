@@ -109,37 +109,6 @@ def write_panda(folder: Path) -> Path:
     return home / "urdf" / "panda.urdf"
 
 
-def ur5() -> str:
-    """Six joints on a base, drawn by Collada files beside it, one of them with a collision."""
-    names = ["base_link", "shoulder_link", "upper_arm_link", "forearm_link"]
-    names += [f"wrist_{k}_link" for k in (1, 2, 3)]
-    joints = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"]
-    joints += [f"wrist_{k}_joint" for k in (1, 2, 3)]
-    axes = ["0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1", "0 1 0"]
-    return robot(
-        "ur5",
-        *(
-            link(name, 4.0 - 0.5 * k, "../meshes/link.dae", "../meshes/link.stl")
-            for k, name in enumerate(names)
-        ),
-        *(
-            joint(name, names[k], names[k + 1], axes[k], limits=(-6.28, 6.28), effort=150.0)
-            for k, name in enumerate(joints)
-        ),
-    )
-
-
-def write_ur5(folder: Path) -> Path:
-    """The ur5 in folder/robots/ur5.urdf, without a package, and its meshes in folder/meshes."""
-    for name in ("robots", "meshes"):
-        (folder / name).mkdir()
-    (folder / "meshes" / "link.dae").write_text(COLLADA)
-    (folder / "meshes" / "link.stl").write_bytes(binary_stl())
-    (folder / "robots" / "ur5.urdf").write_text(ur5())
-    (folder / "package.xml").write_text("<package><name>ur_description</name></package>")
-    return folder / "robots" / "ur5.urdf"
-
-
 def mobile_arm() -> str:
     """An arm of two joints on a base with two wheels that nothing holds."""
     return robot(

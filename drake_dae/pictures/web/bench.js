@@ -135,7 +135,6 @@ const act = {
   slower: () => change_rate(-1),
   faster: () => change_rate(1),
   restart,
-  view: () => view.reset(),
 };
 for (const [name, action] of Object.entries(act)) element(name).addEventListener("click", action);
 

@@ -50,7 +50,7 @@ class Plot {
       const between = low + part * (high - low);
       const value = Math.abs(between) < 1e-3 * (high - low) ? 0 : between;
       this.line([[left, y(value)], [right, y(value)]], "#e2e2e8", 1);
-      this.text(tick(value, high - low), "right", left - 4, y(value) + 4);
+      this.text(short(value, 5), "right", left - 4, y(value) + 4);
     }
     for (let t = Math.ceil(first); t <= last; t++) this.text(`${t} s`, "center", x(t), height - 5);
     let place = 6;
@@ -68,17 +68,9 @@ class Plot {
   }
 }
 
-/* A number at an axis of some length: with digits that tell it from its neighbours. */
-function tick(value, length) {
-  const size = Math.abs(value);
-  if (!size || size < 1e-3 || size >= 1e4) return short(value);
-  const digits = Math.min(Math.max(3, 2 + Math.ceil(Math.log10(size / length))), 9);
-  return String(Number(value.toPrecision(digits)));
-}
-
-/* A number with three digits. */
-function short(value) {
+/* A number with few digits. */
+function short(value, digits = 3) {
   const size = Math.abs(value);
   if (size && (size < 1e-3 || size >= 1e4)) return value.toExponential(1);
-  return String(Number(value.toPrecision(3)));
+  return String(Number(value.toPrecision(digits)));
 }

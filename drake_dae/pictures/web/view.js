@@ -17,10 +17,6 @@ class View {
     this.push = new three.ArrowHelper(new three.Vector3(0, 0, 1), new three.Vector3(), 1, 0x8833bb);
     viewer.scene.add(this.push);
     this.show_push(null);
-    for (const name of ["pointerdown", "wheel"]) { /* Before it turns for the first time. */
-      viewer.dom_element.addEventListener(name, () => (this.camera ??=
-        { position: viewer.camera.position.clone(), target: viewer.controls.target.clone() }), { capture: true });
-    }
     new ResizeObserver(() => {
       viewer.set_3d_pane_size();
       /* The camera is placed for a pane of 4 to 3. A narrower pane shows as much of the robot. One
@@ -30,14 +26,6 @@ class View {
       camera.updateProjectionMatrix();
       viewer.set_dirty();
     }).observe(viewer.dom_element);
-  }
-  /* The camera as it was when the page was opened. */
-  reset() {
-    if (!this.camera) return;
-    viewer.camera.position.copy(this.camera.position);
-    viewer.controls.target.copy(this.camera.target);
-    viewer.controls.update();
-    viewer.set_dirty();
   }
   /* The arrow of a push, with its force; without a point there is none. */
   show_push(point, force, most) {

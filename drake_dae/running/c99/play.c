@@ -86,7 +86,6 @@ static int compare(void) {
   return failures;
 }
 
-#ifdef CLOCK_MONOTONIC
 static int by_size(const void *a, const void *b) {
   float x = *(const float *)a, y = *(const float *)b;
   return (x > y) - (x < y);
@@ -108,9 +107,6 @@ static void take_time(void) {
   printf("a step: %.3g us in the median, %.3g us at the 99.9th percentile, %.3g us at most, of %d"
          " calls\n", times[CALLS / 2], times[CALLS - CALLS / 1000], times[CALLS - 1], CALLS);
 }
-#else
-static void take_time(void) {}
-#endif
 
 int main(int argc, char **argv) {
   if (!load(argc > 1 ? argv[1] : "${name}_${kind}_run.csv")) return 1;

@@ -9,11 +9,12 @@ import numpy as np
 
 from referee.derive import balance, exact, frames
 from referee.description import Mechanism, force_names
+from referee.engines import ours
 from referee.reference import MOTIONS, STATES, Lines, load
 from referee.spatial import MECHANISMS
 
 ENGINES = ("ours", "drake_joints", "mujoco_engine", "pinocchio_engine")
-"""The modules of `engines`: NAME, NOTE, `forces`, and where it has one `mass_matrix`, `after`."""
+"""The modules of `engines`: NAME, NOTE and `forces`; of a soft one also `mass_matrix`."""
 
 SAME_MODEL = 1e-12
 """The largest relative difference of a mass matrix from the reference's."""
@@ -22,9 +23,11 @@ HEAD = """# Constraint forces of mechanisms: correct digits
 
 Made by `make table NAME=referee`. Each number is -log10 of the largest error of all
 constraint forces of the mechanism, in the size of the largest one, rounded down; doubles
-hold 15 or 16. After a motion, for drake_dae, it is the least of forces, positions and rates.
+hold 15 or 16.
 What each engine solves, at the best settings found:
 """
+
+MOVED = "least digits of forces, positions and rates"
 
 Cell = float | str
 """The correct digits of an engine's forces, 0 to 16, or why it cannot tell."""
@@ -80,19 +83,11 @@ def compare_state(engine: ModuleType, mechanism: Mechanism, lines: Lines) -> Cel
     return correct_digits(found, wanted_forces(mechanism, lines))
 
 
-def compare_motion(engine: ModuleType, mechanism: Mechanism, start: Lines, end: Lines) -> Cell:
-    """An engine's forces after the motion; the least of those of q and v, if any."""
-    if not hasattr(engine, "after"):
-        return "it has no integrator of constrained motion"
-    try:
-        found = engine.after(mechanism, *state_of(mechanism, start))
-    except NotImplementedError as error:
-        return str(error)
-    except (RuntimeError, ValueError) as error:  # The other mechanisms go on.
-        return f"it fails with {str(error).splitlines()[0]!r}"
-    q, v = state_of(mechanism, end)
+def compare_motion(mechanism: Mechanism, start: Lines, end: Lines) -> float:
+    """The least of our digits of forces, q and v after the motion."""
+    found = ours.after(mechanism, *state_of(mechanism, start))
     parts = [(stacked(mechanism, found), wanted_forces(mechanism, end))]
-    parts += [(found[key], value) for key, value in (("q", q), ("v", v)) if key in found]
+    parts += zip((found["q"], found["v"]), state_of(mechanism, end), strict=True)
     return min(correct_digits(*part) for part in parts)
 
 
@@ -106,7 +101,7 @@ def table(title: str, heads: Sequence[str], cells: dict[str, dict[str, Cell]]) -
             if isinstance(cell, str):
                 reasons.setdefault((head, cell), []).append(name)
     lines = ["| " + " | ".join(row) + " |" for row in rows]
-    lines += ["", "Why there is a '-':", ""]
+    lines += ["", "Why there is a '-':", ""] if reasons else []
     lines += [f"- {head}, {', '.join(who)}: {why}." for (head, why), who in reasons.items()]
     return "\n".join([*lines, ""])
 
@@ -122,13 +117,13 @@ def main(names: Sequence[str]) -> None:
         mechanism = MECHANISMS[name]
         states[name] = {e.NAME: compare_state(e, mechanism, start) for e in engines}
         if name in end:
-            title = f"{name}, {mechanism.duration:g} s"
-            motions[title] = {e.NAME: compare_motion(e, mechanism, start, end) for e in engines}
+            digits = compare_motion(mechanism, start, end)
+            motions[f"{name}, {mechanism.duration:g} s"] = {MOVED: digits}
         print(name, "is compared", flush=True)
     notes = [f"- **{engine.NAME}**: {engine.NOTE}." for engine in engines]
     heads = [engine.NAME for engine in engines]
     found = "## At the stated state\n\n" + table("mechanism", heads, states)
-    after = "## After the motion\n\n" + table("mechanism, s", heads, motions)
+    after = "## drake_dae after a motion\n\n" + table("mechanism, s", [MOVED], motions)
     text = "\n".join([HEAD, *notes, *(f"- {sentence}" for sentence in missing), "", found, after])
     print("\n" + text)
     if not names:

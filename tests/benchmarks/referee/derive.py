@@ -225,22 +225,11 @@ def rows_of(
             turns = [turn(u, np.cross(frame_a.spin, u), u @ off) for u in held]
         return turns + [shift(u, still) for u in IDENTITY]
     normal = exact(closure.direction)
-    if closure.kind == "plane":
-        row = shift(normal, still)
-        row.drive, moving_up = exact(closure.road)
-        row.bias -= moving_up
-        row.force = C_b @ (normal + friction(closure, moving))
-        return [row]
-    # A ball: the material point that touches, at -radius normal from the center, is at rest.
-    radius = mpf(repr(closure.size))
-    lever = normal * -radius
-    found = []
-    for k, u in enumerate(IDENTITY):
-        gradient = (C_b + np.cross(W_b, lever)) @ u
-        bias = u @ (b[2] + np.cross(frame_b.spin_rate, lever))
-        gap = normal @ apart - radius if abs(normal[k]) == 1 else None
-        found.append(Row(closure, gap, gradient, bias, gradient))
-    return found
+    row = shift(normal, still)
+    row.drive, moving_up = exact(closure.road)
+    row.bias -= moving_up
+    row.force = C_b @ (normal + friction(closure, moving))
+    return [row]
 
 
 def held_axes(closure: Closure, frame: Frame) -> list[Array]:

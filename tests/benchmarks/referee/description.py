@@ -49,7 +49,6 @@ class Closure:
     - "plane": point B is in the plane through A with the normal `direction`, fixed in the world,
       with Coulomb's `friction` while it slides; the force with its friction. The plane may move
       along its normal, with `road`: its velocity and acceleration at the stated time.
-    - "ball": a ball of the radius `size` with the center B rolls on that plane; the force.
     - "gear": the position of `body_b` is `size` times that of `body_a` (one joint each); the moment
       on body B, which gives `size` times the opposite on A.
     """
@@ -124,7 +123,6 @@ def force_names(closure: Closure) -> list[str]:
         "hinge": moment + force,
         "distance": ["thrust"],
         "plane": force,
-        "ball": force,
         "gear": ["moment"],
     }
     return [f"{closure.name}.{name}" for name in kinds[closure.kind]]

@@ -149,17 +149,6 @@ TABLE = Mechanism(
     split="least sum of squares of the normal forces, N^2: legs of equal stiffness",
 )
 
-ROLLING_BALL = Mechanism(
-    "rolling_ball",
-    (Body("ball", FREE, mass=0.9, center=(0.01, 0.02, -0.04), inertia=(0.004, 0.005, 0.006)),),
-    (Closure("ground", "ball", "world", (0.0, 0.0, 0.0), "ball", (0.0, 0.0, 0.0), size=0.12),),
-    q=(0.0, 0.0, 0.12, 0.4, 0.3, -0.5),
-    v={3: 1.0, 4: 2.5, 5: -1.5},
-    free=(3, 4, 5),
-    placed=(0, 1, 3, 4, 5),
-    duration=0.1,
-)
-
 GEARS = Mechanism(
     "gears",
     (
@@ -185,15 +174,6 @@ GEARS = Mechanism(
 
 MECHANISMS = {
     mechanism.name: mechanism
-    for mechanism in (
-        *PLANAR_MECHANISMS,
-        TOP,
-        BRICARD,
-        TWO_ARMS,
-        HUMANOID,
-        TABLE,
-        ROLLING_BALL,
-        GEARS,
-    )
+    for mechanism in (*PLANAR_MECHANISMS, TOP, BRICARD, TWO_ARMS, HUMANOID, TABLE, GEARS)
 }
 """All mechanisms of the referee, by name."""

@@ -214,38 +214,6 @@ def test_angles_that_are_too_large_for_the_lanes_are_no_less_accurate(monkeypatc
     assert_same(*found, 1e-13)
 
 
-@pytest.mark.slow
-def test_samples_go_on_beside_a_run_that_fails(monkeypatch):
-    """Compliant contact at 1 kHz, where the first run leaves all numbers.
-
-    Round-off of sums of other order, 1e-15 of what is summed, in 300 steps.
-    """
-    settings = (
-        "plant=!CompliantContact {stiffness: 1.0e5, friction: 0.2}",
-        "sampling={period: 1.0e-3, delay: 1.0e-3}",
-        "law.constraint_damping=!Poles {all: [-50.0]}",
-        "law.gains.all=[-25.0]",
-    )
-    chosen = scenario("two_link_wall", *settings)
-    loop, context = build_scenario(chosen)
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    rows = []
-    for index, mass in enumerate(np.linspace(6.0, 6.2, COUNT)):
-        loop.plant.set_parameter(own, "link2.mass", mass)
-        loop.plant.set_parameter(own, "wall.position", [1.2 - 1e50 * (index == 0), 0.0, 0.0])
-        start, parameters = start_values(loop, context)
-        rows.append(parameters)
-    times = 1e-3 * np.arange(301)
-    arguments = loop, np.tile(start, (COUNT, 1)), np.array(rows), times
-    ours, theirs = both_ways(monkeypatch, *arguments, config=chosen.integrator)
-    for index, (one, other) in enumerate(zip(ours, theirs, strict=True)):
-        assert (one.failure is None) == (index != 0)
-        assert str(one.failure) == str(other.failure)
-        np.testing.assert_allclose(one.record["state"], other.record["state"], atol=1e-10)
-    slow = rollout(loop, start, rows[0], times, compiled=False)[0]
-    assert str(slow.failure) == str(ours[0].failure)
-
-
 def given_of(*arrays):
     return [each.ctypes.data_as(ctypes.c_void_p) for each in arrays]
 

@@ -111,6 +111,8 @@ FAULTS = [
     ("r.urdf", 'mass value="1"', 'mass value="${m}"', r"r\.urdf:\d+: link 'a'.*\{m\}"),
     ("r.urdf", 'mass value="1"', 'mass value="1,5"', r"r\.urdf:\d+: link 'a'.*1,5"),
     ("r.urdf", 'mass value="1"', 'mass value="0"', "'a'"),
+    ("r.urdf", 'mass value="1"', 'mass value="-4.0"', r"r\.urdf:3: link 'a'"),
+    ("r.urdf", 'parent link="a"', 'parent link="none"', r"r\.urdf"),
     ("r.urdf", 'xyz="0 0 1"', 'xyz="0 -1"', "3 values .* 0 -1"),
     ("r.urdf", 'xyz="0.01 -0.02 0.12"', 'xyz="nan 0 0"', "3 values .* nan"),
     ("r.urdf", '"revolute"', '"planar"', "'j'"),

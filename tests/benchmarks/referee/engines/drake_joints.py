@@ -8,17 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 from referee.description import Body, Mechanism
 from referee.tree import add_tree
 
 NAME = "Drake, joints"
-NOTE = (
-    "reaction forces of joints in continuous time; trees alone. Motions by runge_kutta5 with error "
-    "control at 1e-14"
-)
-CONFIG = SimulatorConfig(integration_scheme="runge_kutta5", accuracy=1e-14, use_error_control=True)
+NOTE = "reaction forces of joints in continuous time; trees alone"
 
 
 def as_tree(mechanism: Mechanism) -> tuple[Mechanism, list[int]]:
@@ -56,37 +51,16 @@ def relative(tree: Mechanism, turns: list[int], values: np.ndarray) -> np.ndarra
     return np.array(found)
 
 
-def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """M of the tree before it is pinned."""
-    plant = MultibodyPlant(0.0)
-    add_tree(plant, mechanism)
-    plant.Finalize()
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, q)
-    return plant.CalcMassMatrix(context)
-
-
-def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The forces after the motion from there."""
-    return forces(mechanism, q, v, mechanism.duration)
-
-
-def forces(
-    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float = 0.0
-) -> dict[str, np.ndarray]:
-    """The force of each closure in the components of `force_names`, after a while."""
+def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`."""
     tree, turns = as_tree(mechanism)
     plant = MultibodyPlant(0.0)
     add_tree(plant, tree)
     plant.Finalize()
-    simulator = Simulator(plant)
-    ApplySimulatorConfig(CONFIG, simulator)
-    context = simulator.get_mutable_context()
+    context = plant.CreateDefaultContext()
     chained = any(body.parent != "world" for body in tree.bodies)
     plant.SetPositions(context, relative(tree, turns, q) if chained else q[turns])
     plant.SetVelocities(context, relative(tree, turns, v) if chained else v[turns])
-    if duration:
-        simulator.AdvanceTo(duration)
     reactions = plant.get_reaction_forces_output_port().Eval(context)
     found = {}
     for closure, body in zip(mechanism.closures, tree.bodies, strict=True):

@@ -8,21 +8,15 @@ from referee.description import Closure, Mechanism
 NAME = "MuJoCo"
 NOTE = (
     "soft constraints: regularized acceleration, impedance at its largest value of 0.9999, "
-    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in 10,000 steps, with a "
-    "time constant of two steps, the least"
+    "Newton's solver to 1e-15, elliptic cones"
 )
 HARD = 'solimp="0.9999 0.9999 0.001 0.5 2" solref="-1e-9 -1e-9"'
 """At a consistent state the reference acceleration is zero, so no stiffness is needed."""
-
-STEPS = 10_000
-"""The steps of a motion."""
 
 # Of the top at q = 0, where its first and last axes are one: MuJoCo writes it into a file.
 mujoco.set_mju_user_warning(lambda message: None)
 
 RADIUS = 0.01
-GRIP = 10.0
-"""The friction of a ball that must not slip."""
 
 SLIDING = 'solreffriction="-1e-9 -15"'
 """Friction that reaches its cone; more would make the normal force larger."""
@@ -95,34 +89,22 @@ def xml(mechanism: Mechanism, geoms: dict[str, list[str]]) -> str:
 
 
 def solved(
-    mechanism: Mechanism,
-    q: np.ndarray,
-    v: np.ndarray,
-    geoms: dict[str, list[str]],
-    duration: float = 0.0,
+    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, geoms: dict[str, list[str]]
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The model, and its data after the forward dynamics at a state, or a while later."""
-    text = xml(mechanism, geoms)
-    step = duration / STEPS
-    if duration:
-        text = text.replace('solref="-1e-9 -1e-9"', f'solref="{2 * step} 1"')
-    model = mujoco.MjModel.from_xml_string(text)
-    if duration:
-        model.opt.timestep, model.opt.integrator = step, mujoco.mjtIntegrator.mjINT_RK4
+    """The model, and its data after the forward dynamics at a state."""
+    model = mujoco.MjModel.from_xml_string(xml(mechanism, geoms))
     data = mujoco.MjData(model)
     for i in range(mechanism.size):
         joint = model.joint(f"j{i}")
         data.qpos[joint.qposadr[0]], data.qvel[joint.dofadr[0]] = q[i], v[i]
         data.qfrc_applied[joint.dofadr[0]] = mechanism.torques.get(i, 0.0)
-    for _ in range(STEPS if duration else 0):
-        mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     return model, data
 
 
 def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, list[str]]:
     """A plane for each contact, and a ball on the body that touches it at the point."""
-    touching = [c for c in mechanism.closures if c.kind in ("plane", "ball")]
+    touching = [c for c in mechanism.closures if c.kind == "plane"]
     geoms: dict[str, list[str]] = {}
     if not touching:
         return geoms
@@ -130,10 +112,7 @@ def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[st
     for closure in touching:
         normal = np.array(closure.direction)
         rotation = data.xmat[model.body(closure.body_b).id].reshape(3, 3)
-        ball = closure.kind == "ball"
-        radius = closure.size if ball else RADIUS
-        center = np.array(closure.point_b) + (0 if ball else RADIUS * rotation.T @ normal)
-        friction = GRIP if ball else closure.friction
+        center, friction = closure.point_b + RADIUS * rotation.T @ normal, closure.friction
         plane, sphere = (f'name="{closure.name}_{end}" contype="0" conaffinity="0"'
                          for end in ("plane", "ball"))  # fmt: skip
         geoms.setdefault("world", []).append(
@@ -141,7 +120,7 @@ def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[st
             f'zaxis="{numbers(normal)}"/>'
         )
         geoms.setdefault(closure.body_b, []).append(
-            f'<geom {sphere} type="sphere" size="{radius}" pos="{numbers(center)}" mass="0"/>'
+            f'<geom {sphere} type="sphere" size="{RADIUS}" pos="{numbers(center)}" mass="0"/>'
         )
         geoms.setdefault("pairs", []).append(
             f'<pair geom1="{closure.name}_plane" geom2="{closure.name}_ball" margin="0.001" '
@@ -160,25 +139,16 @@ def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarra
     return full[np.ix_(order, order)]
 
 
-def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The forces after the motion from there."""
-    if any(closure.kind == "plane" for closure in mechanism.closures):
-        raise NotImplementedError("a ball stands for the point that touches: other motion")
-    return forces(mechanism, q, v, mechanism.duration)
-
-
-def forces(
-    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float = 0.0
-) -> dict[str, np.ndarray]:
-    """The force of each closure in the components of `force_names`, after a while."""
+def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`."""
     if any(any(closure.road) for closure in mechanism.closures):
         raise NotImplementedError("no constraint that moves with time")
     if any(closure.kind == "hinge" for closure in mechanism.closures):
         raise NotImplementedError("no hinge among the equality constraints")
-    model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v), duration)
+    model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v))
     found = {}
     for closure in mechanism.closures:
-        if closure.kind in ("plane", "ball"):
+        if closure.kind == "plane":
             found[closure.name] = contact_force(model, data, closure)
             continue
         number = model.equality(closure.name).id
@@ -208,8 +178,6 @@ def moment(
 def contact_force(model: mujoco.MjModel, data: mujoco.MjData, closure: Closure) -> np.ndarray:
     """The force of a contact on the body, in the world."""
     target = data.site(f"{closure.name}_b").xpos
-    if closure.kind == "ball":
-        target = target - closure.size * np.array(closure.direction)
     if not data.ncon:
         raise NotImplementedError("the contact opened")
     near = min(range(data.ncon), key=lambda i: np.linalg.norm(data.contact[i].pos - target))

@@ -2,13 +2,11 @@
 
 from functools import cache
 
-import casadi as ca
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.robots import RollingBall
 from referee.description import Closure, Mechanism
 from referee.tree import add_tree, controls, frame_at
 
@@ -58,19 +56,8 @@ def constraint(mechanism: Mechanism, closure: Closure) -> object:
         )
         return dd.JointCoupler(follower, leader, closure.size, name=name)
     plane = dd.Plane(closure.point_a, closure.direction)
-    if closure.kind == "ball":
-        return RollingBall(b, plane, closure.size, name=name)
     friction = closure.friction or None
     return dd.PointOnSurface(b, plane, name=name, friction=friction, stiction_tolerance=STILL)
-
-
-def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """M in the order of the description."""
-    links = model_of(mechanism).links
-    values = [parameter.value for parameter in links.parameters]
-    symbols = [parameter.symbol for parameter in links.parameters]
-    function = ca.Function("M", [links.q, *symbols], [links.mass_matrix])
-    return np.array(function(q, *values))
 
 
 def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:

@@ -18,7 +18,6 @@ REFUSED = {
     "gear": "no gear among its constraints",
     "plane": "its points are fixed in all directions; contacts that slide are solved for rates, "
     "after a step of time",
-    "ball": "no rolling among its constraints",
 }
 
 
@@ -43,16 +42,6 @@ def model_of(mechanism: Mechanism) -> tuple[pin.Model, dict[str, int]]:
 def order(mechanism: Mechanism, model: pin.Model) -> list[int]:
     """The place of each joint of the description in the model's vectors."""
     return [model.idx_vs[model.getJointId(f"j{i}")] for i in range(mechanism.size)]
-
-
-def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """M in the order of the description."""
-    model, _ = model_of(mechanism)
-    places = order(mechanism, model)
-    own = np.zeros(model.nq)
-    own[places] = q
-    matrix = pin.crba(model, model.createData(), own)
-    return (np.triu(matrix) + np.triu(matrix, 1).T)[np.ix_(places, places)]
 
 
 def solver(mechanism: Mechanism, q: np.ndarray, v: np.ndarray, proximal: tuple = PROXIMAL) -> tuple:
