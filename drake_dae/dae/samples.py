@@ -1,6 +1,7 @@
 """Consistent states in a box, numbers of expressions at them, and members of a family."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import casadi as ca
@@ -13,7 +14,7 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.signals import Indices
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.numerics import are_dependent, positive
+from drake_dae.trace.numerics import NewtonModel, are_dependent, newton, positive
 
 # The allowed distance of a state from the box after Newton's method, relative to the box.
 SLACK = 1e-6
@@ -134,14 +135,50 @@ class Samples:
             fixed |= blocked
 
     def _project(self, guess: FloatArray) -> FloatArray:
-        """A consistent state in the box near a guess."""
-        low, high = self._box
+        """A consistent state in the box near a guess; by Newton steps inside it if need be."""
+        (low, high), manifold, scale = self._box, self.manifold, self.system.scale
         slack = SLACK * np.maximum(np.maximum(np.abs(low), np.abs(high)), high - low)
-        state = self.manifold.project(guess)
-        if not np.all((state >= low - slack) & (state <= high + slack)):
+
+        def holds(state: FloatArray) -> bool:
+            return bool(np.all((state >= low - slack) & (state <= high + slack)))
+
+        def linearize(z: FloatArray) -> NewtonModel | None:
+            gradient = manifold.gradients(scale * z) * scale
+            if not np.all(np.isfinite(gradient)):
+                return None
+
+            def step(z: FloatArray) -> FloatArray:
+                residual = manifold.residual(scale * z)
+                return _bounded_step(gradient, residual, low / scale - z, high / scale - z)
+
+            return NewtonModel(step, True)
+
+        with suppress(InconsistentStateError):
+            state = manifold.project(guess)
+            if holds(state):
+                return state
+        start = np.clip(guess / scale, low / scale, high / scale)
+        state = manifold.project(scale * newton(start, linearize)[0])
+        if not holds(state):
             text = f"{self.system.name}: no consistent state found between the samples"
-            raise InconsistentStateError(text, self.manifold.residual(np.clip(state, low, high)))
+            raise InconsistentStateError(text, manifold.residual(np.clip(state, low, high)))
         return state
+
+
+def _bounded_step(
+    gradient: FloatArray, residual: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """A short dx with C dx + r = 0; components are limited by the bounds."""
+    step, free = np.zeros(low.size), low < high
+    while free.any():
+        remaining = residual + gradient[:, ~free] @ step[~free]
+        step[free] = -np.linalg.lstsq(gradient[:, free], remaining)[0]
+        past = free & ((step < low) | (step > high))
+        step[past] = np.clip(step[past], low[past], high[past])
+        free &= ~past
+        if not past.any():
+            break
+    return step
 
 
 def outside(system: DaeSystem, what: str, state: FloatArray) -> ModelError:
