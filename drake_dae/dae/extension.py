@@ -79,15 +79,14 @@ def dynamic_extension(
     after which only q controls act in them; see `Extension.integrators`. Each round reduces the
     dimension of the zero dynamics by the rank deficiency of B(x), so that it ends after few rounds.
 
+    The system stays as it is if its B(x) is regular.
+
     Args:
         system: The system (1)-(3).
         nominal_control: Values of the controls at the nominal state, for the integrators that hold
             them; zero where not given.
-        spread: The standard deviation of the random states, as in `find_structure`. That of a
-            control is 0.1 of its nominal value; 0.1 if that is zero.
-
-    Returns:
-        The extended system; the original one if its B(x) is regular.
+        spread: The standard deviation of the random states, as in `find_structure`; of a control
+            0.1 of its nominal value, or 0.1.
 
     Raises:
         AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
