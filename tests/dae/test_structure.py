@@ -10,7 +10,7 @@ from runs import some
 
 from drake_dae.analysis import Finding, analyze
 from drake_dae.dae import DaeSystem, find_constraint_structure, find_structure
-from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
+from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -70,22 +70,6 @@ def test_a_force_that_the_control_does_not_act_on_is_not_met_at_once():
     error = violation(resting)
     assert error.assumption == 4
     assert "'tension'" in str(error)
-
-
-@pytest.mark.parametrize("k", [lambda x: x[1] ** 2 + 1, lambda x: ca.exp(x[1]) + 0.5])
-def test_a_constraint_that_cannot_be_met(k):
-    with pytest.raises(InconsistentStateError, match="y0"):
-        find_structure(
-            system_of(
-                2,
-                f=lambda x: [0, 0],
-                g=lambda x: [0, 1],
-                h=lambda x: [1, 0],
-                k=k,
-                l=lambda x: x[0],
-                m=lambda x: 0,
-            )
-        )
 
 
 def test_constraints_alone_decide_how_a_system_moves():
