@@ -22,8 +22,6 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.arrays import brief
-from drake_dae.dae import Signal
-from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
 from drake_dae.running import export_loop, start_values
 from drake_dae.scenario.form import load_yaml
@@ -129,7 +127,6 @@ def test_a_context_of_another_loop_is_refused_in_a_sentence(tmp_path):
         (lambda a: DcMotors(a, 1.0, 1.0), "torque_constant"),
         (lambda a: ConstantReference(a), "values"),
         (lambda a: Record(a, {}), "time"),
-        (lambda a: Recorded(a[:, None], [Signal("a")]), "values"),
         (lambda a: Parameter("a", a), "value"),
     ],
 )

@@ -1,6 +1,6 @@
 """Gains of law, observer and estimator for compliant contact and given sensors, as an optimum."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -9,15 +9,9 @@ from math import inf, prod
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import check_whole_number, positive
-from drake_dae.dae.contact_gains import ContactGains, best_damping, pole_gains
-from drake_dae.dae.one_direction import (
-    Direction,
-    DirectionGains,
-    SampledLoop,
-    SensorNoise,
-    sampled_loop,
-)
+from drake_dae.arrays import positive
+from drake_dae.dae.contact_gains import ContactGains, contact_damping, pole_gains
+from drake_dae.dae.one_direction import DirectionGains, SampledLoop, SensorNoise, sampled_loop
 from drake_dae.errors import GainError, ModelError
 
 _PHASE = 0.3
@@ -67,7 +61,7 @@ class SensedContact:
     differences; `estimates` tells whether the state comes from a `StateEstimator`.
 
     Raises:
-        ModelError: A number is not positive, or a noise is negative.
+        ModelError: A number is not positive.
     """
 
     period: float
@@ -82,32 +76,25 @@ class SensedContact:
     estimates: bool
 
     def __post_init__(self) -> None:
-        names = ("period", "stiffness", "mobility", "free_mobility", "lever", "contact_lever")
-        for name in (*names, "inertia"):
+        for name in self.__annotations__.keys() - {"delay", "noise", "estimates"}:
             positive(name, getattr(self, name))
-        check_whole_number("delay", self.delay, 0)
-        for name, value in vars(self.noise).items():
-            if not value >= 0.0:
-                raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
 
     def loop(
         self, rates: DirectionGains, contact: bool, mass_error: float = 1.0, share: float = 1.0
     ) -> SampledLoop:
         """That of a joint's free motion, or of the contact with a fraction of its stiffness."""
+        noise, timing = self.noise, (self.period, self.delay)
         if not contact:
-            return sampled_loop(
-                Direction(self.period, self.delay, mass_error=mass_error), rates, self.noise
-            )
-        stiffness, lever = share * self.stiffness, self.contact_lever
-        direction = Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
-        position, velocity = lever * self.noise.position, lever * self.noise.velocity
-        noise = replace(self.noise, position=position, velocity=velocity)
-        return sampled_loop(direction, rates, noise)
+            return sampled_loop(rates, noise, *timing, mass_error=mass_error)
+        moves = [self.contact_lever * each for each in (noise.position, noise.velocity)]
+        noise = replace(noise, position=moves[0], velocity=moves[1])
+        stiffness = share * self.stiffness
+        return sampled_loop(rates, noise, *timing, self.mobility, stiffness, mass_error)
 
     @cached_property
     def best_damping(self) -> float:
         """`contact_damping` of the contact, in 1/s."""
-        return best_damping(self.stiffness, self.mobility, self.period, self.delay)
+        return contact_damping(self.stiffness, self.mobility, self.period, self.delay)
 
 
 @dataclass(frozen=True)
@@ -153,36 +140,27 @@ def is_stable(situation: SensedContact, part: Part) -> bool:
     )
 
 
-def _free(situation: SensedContact, fast: float | None) -> list[Part]:
-    """The predictions for free directions with all rates, and that of an estimator, in 1/s."""
-    found = []
-    for w, (shape, damping) in product(_rates(situation), SHAPES):
-        if damping == 1.0 and shape * w < SLOWEST:
-            continue
-        gains = pole_gains(shape * w, damping, 3)
-        rates = DirectionGains((gains[0], gains[1], gains[2]), 0.0, shape * w / 0.75, fast)
-        found.append(Part.of(situation, w, rates, False))
-    return found
+def _groups(situation: SensedContact, fast: float | None, contact: bool) -> Iterator[list[Part]]:
+    """The predictions for all rates w, and that of an estimator, in free directions or a contact.
 
-
-def _along(situation: SensedContact, fast: float | None, share: float) -> list[Part]:
-    """The same along the contact, with a factor by which integral and observer are slowed."""
-    found = []
-    for w in _rates(situation):
-        c = min(2.3 * w, situation.best_damping)
-        rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
-        found.append(Part.of(situation, w, rates, True))
-    return found
-
-
-def noisiest_sensor(situation: SensedContact, part: Part, deviation: int) -> str:
-    """The sensor whose noise causes most of an error (deviation 0), or of a roughness (1)."""
-
-    def without(name: str) -> float:
-        quiet = replace(situation, noise=replace(situation.noise, **{name: 0.0}))
-        return quiet.loop(part.rates, part.is_contact).deviations()[deviation]
-
-    return min(("position", "velocity", "force")[: 2 + part.is_contact], key=without)
+    Of a contact there is a group for each of `SLOWER`; the first one that has gains is taken.
+    """
+    if not contact:
+        free = []
+        for w, (shape, damping) in product(_rates(situation), SHAPES):
+            if damping < 1.0 or shape * w >= SLOWEST:
+                low, middle, high = pole_gains(shape * w, damping, 3)
+                rates = DirectionGains((low, middle, high), 0.0, shape * w / 0.75, fast)
+                free.append(Part.of(situation, w, rates, False))
+        yield free
+        return
+    for share in SLOWER:
+        along = []
+        for w in _rates(situation):
+            c = min(2.3 * w, situation.best_damping)
+            rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
+            along.append(Part.of(situation, w, rates, True))
+        yield along
 
 
 @dataclass(frozen=True)
@@ -202,21 +180,6 @@ class AdvisedGains:
     noise_error: float
     noise_force: float
     roughness: float
-
-
-@dataclass(frozen=True)
-class _Bounds:
-    """The largest roughness in N m and errors in m and N."""
-
-    roughness: float
-    position_error: float
-    force_error: float
-
-    def order(self, pair: Sequence[Part]) -> tuple[float, float]:
-        """What is least for the best gains: the errors without a bound, then the roughness."""
-        bounds = self.position_error, self.force_error
-        errors = [part.error for part, most in zip(pair, bounds, strict=True) if most == inf]
-        return prod(errors), _roughness(pair)
 
 
 def _roughness(pair: Sequence[Part]) -> float:
@@ -252,30 +215,36 @@ def advised_gains(
     the bound.
 
     Raises:
-        GainError: No gains do so; the message names the noise or the limit that prevents it.
+        GainError: No gains do so; the message names what prevents it.
         ModelError: The roughness or an error is not positive.
     """
     positive("roughness", roughness)
-    for name, most in (("position_error", position_error), ("force_error", force_error)):
-        if not most > 0.0:
-            raise ModelError(f"{name} must be positive, got {most:g}")
-    bounds = _Bounds(roughness, position_error, force_error)
-    tried = ((_pair(situation, fast, bounds), fast) for fast in _state_rates(situation))
-    candidates = [(*found, fast) for found, fast in tried if found is not None]
+    for name, bound in (("position_error", position_error), ("force_error", force_error)):
+        if not bound > 0.0:
+            raise ModelError(f"{name} must be positive, got {bound:g}")
+    most = position_error, force_error
+    tried = ((_pair(situation, fast, roughness, most), fast) for fast in _state_rates(situation))
+    candidates = [(pair, fast) for pair, fast in tried if pair is not None]
     if not candidates:
-        raise GainError(_reason(situation, bounds))
-    free, contact, fast = min(candidates, key=lambda found: bounds.order(found[:2]))
-    of_free, of_contact = free.rates, contact.rates
-    position, damping = of_free.poles
+        raise GainError(_reason(situation, roughness, most))
+
+    def order(candidate: tuple[tuple[Part, Part], float | None]) -> tuple[float, float]:
+        """The errors without a bound, then the roughness."""
+        pair, _ = candidate
+        errors = (part.error for part, bound in zip(pair, most, strict=True) if bound == inf)
+        return prod(errors), _roughness(pair)
+
+    (free, contact), fast = min(candidates, key=order)
+    own, along, p = free.rates, contact.rates, free.rates.gains[0] ** (1.0 / 3.0)
     return AdvisedGains(
         gains=ContactGains(
-            position_rate=position,
-            force_gain=of_contact.force_gain,
-            constraint_damping=of_contact.gains[2],
-            observer_rate=of_free.observer_rate,
-            observer_force_rate=of_contact.observer_rate,
-            friction_rate=of_free.observer_rate / 4.0,
-            position_damping=damping,
+            position_rate=p,
+            force_gain=along.force_gain,
+            constraint_damping=along.gains[2],
+            observer_rate=own.observer_rate,
+            observer_force_rate=along.observer_rate,
+            friction_rate=own.observer_rate / 4.0,
+            position_damping=(own.gains[2] / p - 1.0) / 2.0,
         ),
         state_rate=fast,
         position_error=free.error,
@@ -302,91 +271,67 @@ def _state_rates(situation: SensedContact) -> list[float | None]:
 
 
 def _pair(
-    situation: SensedContact, fast: float | None, bounds: _Bounds
+    situation: SensedContact, fast: float | None, roughness: float, most: tuple[float, float]
 ) -> tuple[Part, Part] | None:
-    """The best gains of free directions and of the contact, if there are any."""
+    """The best gains of free directions and of the contact, if there are any.
 
-    def free(allowed: float) -> Part | None:
-        return _best(situation, _free(situation, fast), allowed, bounds.position_error)
-
-    def contact(allowed: float) -> Part | None:
-        allowed = min(allowed, bounds.roughness / 2.0**0.5)
-        tried = (_along(situation, fast, share) for share in SLOWER)
-        best = (_best(situation, parts, allowed, bounds.force_error) for parts in tried)
-        return next(filter(None, best), None)
-
+    The part of each has the least error, or the least roughness where its error is bounded, of
+    those that are smooth and stable enough.
+    """
+    found, left = dict[bool, Part](), roughness
     # The contact comes first, with at most its share of the roughness; but free directions do where
     # their error is bounded, since their smoothest gains leave the most.
-    is_free_first = bounds.position_error < inf
-    first, second = (free, contact) if is_free_first else (contact, free)
-    if (one := first(bounds.roughness)) is None:
-        return None
-    if (other := second((bounds.roughness**2 - one.roughness**2) ** 0.5)) is None:
-        return None
-    return (one, other) if is_free_first else (other, one)
+    for contact in (True, False) if most[0] == inf else (False, True):
+        allowed = min(left, roughness / 2.0**0.5) if contact else left
+        for group in _groups(situation, fast, contact):
+            bound = most[contact]
+            within = [part for part in group if part.roughness <= allowed and part.error <= bound]
+            within.sort(key=lambda part: part.error if bound == inf else part.roughness)
+            best = next((part for part in within if is_stable(situation, part)), None)
+            if best is not None:
+                found[contact], left = best, (roughness**2 - best.roughness**2) ** 0.5
+                break
+        else:
+            return None
+    return found[False], found[True]
 
 
-def _best(situation: SensedContact, parts: list[Part], allowed: float, most: float) -> Part | None:
-    """The part with the least error that is smooth and stable enough, if there is one.
-
-    Where the error may be at most a number, it is the smoothest one within it.
-    """
-    within = [part for part in parts if part.roughness <= allowed and part.error <= most]
-    for part in sorted(within, key=lambda part: part.error if most == inf else part.roughness):
-        if is_stable(situation, part):
-            return part
-    return None
+def _stable(situation: SensedContact, contact: bool) -> Iterator[Part]:
+    """All stable gains of free directions, or of the contact."""
+    for fast in _state_rates(situation):
+        for group in _groups(situation, fast, contact):
+            yield from (part for part in group if is_stable(situation, part))
 
 
 def settles_along(situation: SensedContact) -> bool:
     """Whether any gains are stable along the contact with a margin."""
-    tried = product(_state_rates(situation), SLOWER)
-    return any(is_stable(situation, part) for each in tried for part in _along(situation, *each))
+    return any(_stable(situation, True))
 
 
-def _reason(situation: SensedContact, bounds: _Bounds) -> str:
+def _reason(situation: SensedContact, roughness: float, most: tuple[float, float]) -> str:
     """Why no gains are found."""
-    found = []  # The stable parts of free directions and of the contact, for each estimator.
-    for fast in _state_rates(situation):
-        along = [part for share in SLOWER for part in _along(situation, fast, share)]
-        tried = _free(situation, fast), along
-        found.append([[part for part in parts if is_stable(situation, part)] for parts in tried])
-    most_of = bounds.position_error, bounds.force_error
-    names = ("in free directions", "m"), ("along the contact", "N")
-    for parts, (where, unit), most in zip(zip(*found, strict=True), names, most_of, strict=True):
-        stable = [part for some in parts for part in some]
+    smoothest = []
+    for contact in (False, True):
+        where, unit = ("along the contact", "N") if contact else ("in free directions", "m")
+        stable, bound = list(_stable(situation, contact)), most[contact]
         if not stable:
             return (
                 f"no gains are stable {where} with a margin, for a contact of "
                 f"{situation.stiffness:.3g} N/m sampled each {situation.period:g} s with "
                 f"{situation.delay} samples of delay: sample more often, or make it softer"
             )
-        best = min(stable, key=lambda part: part.error)
-        if best.error > most:
-            cause = f"an unknown force of {MODEL_ERROR:g} N that appears every {EVERY:g} s"
-            if best.by_noise > best.error / 2.0:
-                cause = f"the noise of the {noisiest_sensor(situation, best, 0)}"
+        least = min(stable, key=lambda part: part.error)
+        if least.error > bound:
             return (
-                f"the error {where} is {best.error:.3g} {unit} rms with the best gains that are "
-                f"stable, mostly by {cause}, and {most:.3g} {unit} are allowed: allow more, sample "
-                "more often, or use better sensors"
+                f"the error {where} is {least.error:.3g} {unit} rms with the best gains that are "
+                f"stable, {least.by_noise:.3g} {unit} of it by noise, and {bound:.3g} {unit} are "
+                "allowed: allow more, sample more often, or use better sensors"
             )
-    smoothest = []
-    for both in found:  # Of one estimator.
-        bounded = zip(both, most_of, strict=True)
-        within = [[part for part in parts if part.error <= most] for parts, most in bounded]
-        if all(within):
-            smoothest.append([min(parts, key=lambda part: part.roughness) for parts in within])
-    if not smoothest:
-        return (
-            "no rate of the estimator has both errors within their bounds: allow more of one of "
-            "them, sample more often, or use better sensors"
-        )
-    across, into = min(smoothest, key=_roughness)
+        smoothest.append(min(part.roughness for part in stable if part.error <= bound))
     return (
-        f"the noise of the {noisiest_sensor(situation, across, 1)} changes the controls by "
-        f"{across.roughness:.3g} N m in free directions and {into.roughness:.3g} N m along the "
-        "contact from sample to sample with the smoothest gains that are stable and keep the "
-        f"errors; {bounds.roughness:.3g} N m are allowed, of which the contact has at most "
-        f"{bounds.roughness / 2.0**0.5:.3g}: allow more roughness, or use a better sensor"
+        f"the noise of the sensors changes the controls by {smoothest[0]:.3g} N m in free "
+        f"directions and {smoothest[1]:.3g} N m along the contact from sample to sample with the "
+        f"smoothest gains that are stable and keep the errors; {roughness:.3g} N m are allowed, of "
+        f"which the contact has at most {roughness / 2.0**0.5:.3g}: allow more roughness or larger "
+        "errors, or use better sensors"
     )

@@ -7,17 +7,14 @@ import numpy as np
 from scipy.linalg import expm
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.arrays import FloatArray, check_whole_number, positive
 from drake_dae.errors import AdviceWarning, ModelError
 
 INTERVALS = 200
 """The number of steps of an interval in the search for the best damping, which is refined once."""
 
-STIFFER = 2.0
-"""The contact may be stiffer than given by this factor, or softer by any factor."""
-
-STIFFNESSES = np.concatenate([np.geomspace(1e-3, 0.5, 10), np.linspace(0.5, STIFFER, 31)[1:]])
-"""The examined stiffnesses, relative to the given one."""
+STIFFNESSES = np.concatenate([np.geomspace(1e-3, 0.5, 10), np.linspace(0.5, 2.0, 31)[1:]])
+"""The stiffnesses for which gains must be stable, relative to the given one."""
 
 _PHASE = 0.3
 """The allowed loss of phase by sampling and delay at the crossover frequency, in rad."""
@@ -106,8 +103,7 @@ def contact_gains(
         velocity_noise: The deviation of measured velocities in rad/s; 0 for none.
 
     The gains are valid if the contact is stable for all lower stiffnesses and up to twice the given
-    one. With one sample of delay this holds at least up to sqrt(A k) T = 0.6, see
-    `contact_damping`.
+    one: sqrt(A k) T at most 0.6 with one sample of delay, 1.3 with none, 0.36 with two.
 
     Warns:
         AdviceWarning: The contact is outside the range in which the gains are valid.
@@ -115,12 +111,10 @@ def contact_gains(
     Raises:
         ModelError: A number is not positive, or is negative.
     """
-    best = best_damping(stiffness, mobility, sample_time, delay)
-    if not sample_time > 0.0:
-        raise ModelError(f"sample_time must be positive, got {sample_time:g}")
+    positive("sample_time", sample_time)
     if not velocity_noise >= 0.0:
         raise ModelError(f"velocity_noise must be 0 or more, got {velocity_noise:g}")
-    check_whole_number("delay", delay, 0)
+    best = contact_damping(stiffness, mobility, sample_time, delay)
     rate = _PHASE / (3.0 * (delay + 0.5) * sample_time)
     if velocity_noise:
         rate = min(rate, _JITTER / (14.0**0.5 * velocity_noise))
@@ -128,10 +122,24 @@ def contact_gains(
     # Where the sampled law cannot damp the contact, its own damping must suffice and the force is
     # changed slowly.
     force_gain = 0.4 * (damping or rate / 2.0)
-    frequency = (stiffness * mobility) ** 0.5
-    lost = unstable_from(frequency, sample_time, delay, damping, force_gain)
-    advice = f"a damping of {damping:.4g} 1/s with an integral of {force_gain:.4g} 1/s"
-    warn_of(lost, stiffness, frequency * sample_time, advice)
+
+    def is_stable(share: float) -> bool:
+        swing = (share * stiffness * mobility) ** 0.5 * sample_time
+        step = _step(swing / sample_time, sample_time)
+        return swing < np.pi and _radius(step, damping, delay, force_gain * swing) < 1.0
+
+    lost = next((share for share in STIFFNESSES.tolist() if not is_stable(share)), None)
+    if lost is not None:
+        swing = (stiffness * mobility) ** 0.5 * sample_time
+        warnings.warn(
+            f"a damping of {damping:.4g} 1/s with an integral of {force_gain:.4g} 1/s is outside "
+            "of the range in which the recommendation is valid: a contact of "
+            f"{lost * stiffness:.3g} N/m, which is {lost:.3g} times the given {stiffness:.3g} N/m, "
+            f"is unstable with it. The contact oscillates by {swing:.3g} rad in a sample: sample "
+            "more often, make it softer, or choose the gains yourself",
+            AdviceWarning,
+            stacklevel=3,
+        )
     return ContactGains(1.5 * rate, force_gain, damping, 2.0 * rate, rate, rate / 2.0)
 
 
@@ -141,99 +149,37 @@ def contact_damping(
 ) -> float:
     """Returns the damping c for which a contact of the stated stiffness settles fastest.
 
-    It is the optimum, without a margin.
-
-    On a compliant contact, F = -k phi, a law with `constraint_damping=poles(-c)` leaves
+    It is the optimum, without a margin. On a compliant contact, F = -k phi, a law with
+    `constraint_damping=poles(-c)` leaves
 
         phi'' + c phi' = A (F - lambda_d),    so    phi'' + c phi' + A k phi = -A lambda_d,
 
     which is critically damped at c = 2 sqrt(A k). A changing reference force leaves an error of
     about c lambda_d' / (A k).
 
-    A sampled law holds -c phi' for a sample time T, from a measurement `delay` samples before.
-    Between samples the contact oscillates freely, so (phi, phi', the held value) follow from the
-    previous sample by a matrix. c minimizes its spectral radius. For a slow contact c is 2 w, with
-    w = sqrt(A k). Without contact a delay of one sample gives z^2 - z + c T = 0, which does not
-    oscillate up to c = 1 / (4 T) and is stable up to c = 1 / T; so c stays of this size. At w T of
-    about 1 the held value lags by a quarter of a period and does not damp any more; then c is 0,
-    and the contact needs damping of its own or a shorter sample time.
+    A sampled law holds -c phi' for a sample time T, from a measurement `delay` samples before, so
+    that (phi, phi', the held value) follow from the previous sample by a matrix. c minimizes its
+    spectral radius. For a slow contact c is 2 w, with w = sqrt(A k). At w T of about 1 the held
+    value lags by a quarter of a period and does not damp any more; then c is 0, and the contact
+    needs damping of its own or a shorter sample time.
 
-    The result is valid if the contact is stable for all lower stiffnesses and up to twice the given
-    one: with one sample of delay up to w T = 0.6, with none up to 1.3, with two up to 0.36, with
-    three up to 0.24. Beyond, a warning is issued: a contact that is stiffer by 10 % may diverge
-    there, and above w T = pi its oscillation is aliased.
-
-    Args:
-        stiffness: k in N/m, positive.
-        mobility: A(x) = J M^-1 J^T of the contact in 1/kg, positive: see
-            `ConstraintStructure.constraint_matrix`. Take the largest along the motion.
-        sample_time: T in s; 0 for a law that runs continuously.
-        delay: The delay of the control in samples.
-
-    Returns:
-        c in 1/s, from 0 to 2 sqrt(A k).
-
-    Warns:
-        AdviceWarning: The contact is outside the range in which the result is valid.
+    The stiffness is k in N/m, the mobility A = J M^-1 J^T in 1/kg, the largest along the motion;
+    sample_time is T in s, 0 for a law that runs continuously, and c is in 1/s.
 
     Raises:
         ModelError: A number is not positive, or is negative.
     """
-    best = best_damping(stiffness, mobility, sample_time, delay)
-    if sample_time:
-        frequency = float(np.sqrt(mobility * stiffness))
-        lost = unstable_from(frequency, sample_time, delay, best)
-        warn_of(lost, stiffness, frequency * sample_time, f"a damping of {best:.4g} 1/s")
-    return best
-
-
-def best_damping(stiffness: float, mobility: float, sample_time: float, delay: int) -> float:
-    """Acts as `contact_damping`, without a warning outside the range of validity."""
-    for name, value, least in (
-        ("stiffness", stiffness, "positive"),
-        ("mobility", mobility, "positive"),
-        ("sample_time", sample_time, "0 or more"),
-    ):
-        if not (value > 0.0 or (value == 0.0 and least != "positive")):
-            raise ModelError(f"{name} must be {least}, got {value:g}")
+    frequency = (positive("mobility", mobility) * positive("stiffness", stiffness)) ** 0.5
     check_whole_number("delay", delay, 0)
-    frequency = float(np.sqrt(mobility * stiffness))
-    critical = 2.0 * frequency
     if sample_time == 0.0:
-        return critical
-    step, low, high = _step(frequency, sample_time), 0.0, critical
+        return 2.0 * frequency
+    step = _step(frequency, positive("sample_time", sample_time))
+    low, high = 0.0, 2.0 * frequency
     for _ in range(2):
         tried = np.linspace(low, high, INTERVALS + 1)
         best = int(np.argmin([_radius(step, c, delay) for c in tried]))
         low, high = tried[max(best - 1, 0)], tried[min(best + 1, INTERVALS)]
     return float(tried[best])
-
-
-def unstable_from(
-    frequency: float, sample_time: float, delay: int, damping: float, integral: float = 0.0
-) -> float | None:
-    """Returns the lowest relative stiffness at which a contact is unstable, if there is one."""
-    for share in STIFFNESSES.tolist():
-        natural = frequency * share**0.5
-        added = integral * natural * sample_time
-        shown = natural * sample_time < np.pi
-        if not (shown and _radius(_step(natural, sample_time), damping, delay, added) < 1.0):
-            return share
-    return None
-
-
-def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> None:
-    """Warns if a recommended gain is outside the range in which it is valid."""
-    if lost is None:
-        return
-    warnings.warn(
-        f"{advice} is outside of the range in which the recommendation is valid: a contact of "
-        f"{lost * stiffness:.3g} N/m, which is {lost:.3g} times the given {stiffness:.3g} N/m, is "
-        f"unstable with it. The contact oscillates by {swing:.3g} rad in a sample: sample more "
-        "often, make it softer, or choose the gains yourself",
-        AdviceWarning,
-        stacklevel=4,
-    )
 
 
 def _step(frequency: float, sample_time: float) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import comb
 
 import casadi as ca
 import numpy as np
@@ -43,8 +42,6 @@ def with_disturbance(
             f"{system.name}: with_disturbance needs names of states, each once, got "
             f"{', '.join(states) or 'none'}"
         )
-    if DISTURBANCE in [p.name for p in system.parameters]:
-        raise ModelError(f"{system.name} has a parameter '{DISTURBANCE}' already")
     parameter = Parameter(DISTURBANCE, np.zeros(len(rows)), exogenous=True)
     force = ca.SX(system.num_states, 1)
     force[rows] = parameter.symbol
@@ -83,9 +80,8 @@ def estimated_within(
 class IdentifiedTerms:
     """The parameters theta of a system that an observer estimates, c numbers.
 
-    An error delta = theta* - theta leaves the disturbance d = -G delta in the balance of the
-    momentum p, where G is the derivative of p' - S^T (E' x + f + g v + h u) with respect to theta.
-    An error of a surface leaves a distance phi(x) that is not zero in contact.
+    An error delta = theta* - theta leaves the disturbance d = -G delta, where G is the derivative
+    of p' - S^T (E' x + f + g v + h u) by theta; that of a surface a distance phi(x) in contact.
     """
 
     parameters: tuple[Parameter, ...]
@@ -132,12 +128,10 @@ class Observation:
     """The functions that an observer of d evaluates, for a system made by `with_disturbance`.
 
     With the momentum p = S^T E x, whose rate is p' = (S^T E)' x + S^T (f + g v + h u) + d, no
-    derivative of a measurement is needed.
-
-    Where a contact slides, friction is S^T dg/dmu v mu. Where it sticks, friction is a reaction:
-    any force T y, where the columns of T are the gradients of the sliding velocities; if these are
-    not known, the derivatives of S^T dg/dmu v with respect to the velocities at rest, which span
-    the same. The momentum cannot distinguish it from d.
+    derivative of a measurement is needed. Where a contact slides, friction is S^T dg/dmu v mu.
+    Where it sticks, it is a reaction T y, which p cannot distinguish from d: the columns of T are
+    the gradients of the sliding velocities, or the derivatives of S^T dg/dmu v with respect to the
+    velocities at rest, which span the same.
 
     The functions take x first and the parameters last:
 
@@ -149,7 +143,6 @@ class Observation:
         wanted(x, R, t):      x with the velocities r' + t r'' of the reference, on the constraints;
                               None if outputs and constraints do not determine the velocities;
         moving(x):            R with the present rates r' of the outputs, and zeros otherwise.
-
     """
 
     momentum: TracedFunction
@@ -191,7 +184,7 @@ class Observation:
         pushed_by = action[rows] + ca.mtimes(system.h[rows, :], u)
         outputs = {"momentum": momentum, "drift": drift, "inputs": pushed_by}
         signals = {"control": u, "constraint_input": v}
-        function = system.trace("momentum", outputs, signals, often=False)
+        traced = system.trace("momentum", outputs, signals, often=False)
         identified = IdentifiedTerms.of(system, others, outputs, signals)
 
         # The force of a friction coefficient of 1; its power is -mu lambda |v_t|.
@@ -224,7 +217,7 @@ class Observation:
             "directions of friction", directions_of_forces, pressed, often=False
         )
         return cls(
-            function,
+            traced,
             friction,
             directions,
             metric,
@@ -280,14 +273,12 @@ def _wanted(
 def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
     """x' of the states that a mass matrix depends on; inputs and disturbance must not enter it."""
     rate = ca.SX(system.num_states, 1)
-    pattern = ca.DM(ca.jacobian(ca.vec(mass), system.state).sparsity()).full()
-    others = ca.horzcat(system.g, system.h)
-    identity = ca.SX.eye(system.num_states)
-    for i in np.flatnonzero(pattern.any(axis=0)).tolist():
-        is_plain = ca.is_equal(
-            ca.sparsify(system.mass_matrix[i, :]), ca.sparsify(identity[i, :]), 2
-        )
-        if i in rows or not is_plain or ca.sparsify(others[i, :]).nnz():
+    others = system.mass_matrix - ca.SX.eye(system.num_states)
+    driven = ca.horzcat(others, system.g, system.h)
+    for i in range(system.num_states):
+        if not ca.depends_on(mass, system.state[i]):
+            continue
+        if i in rows or ca.sparsify(driven[i, :]).nnz():
             name = system.state_signals[i].name
             raise ModelError(
                 f"{system.name}: the mass that a disturbance accelerates depends on '{name}', "
@@ -307,14 +298,11 @@ Metric = Callable[[ca.SX], ca.SX]
 def shares(
     forces: ca.SX, planes: Sequence[ca.SX], velocity: ca.SX, metric: Metric, d: ca.SX
 ) -> ca.SX:
-    """Returns the part of d that each friction force c explains, as a factor, shape (c, 1):
+    """Returns the part (c~^T W d) / (c~^T W c) of d that each friction force c explains, (c, 1).
 
-        (c~^T W d) / (c~^T W c),
-
-    where c~ is c without the part that a contact force orthogonal to the sliding explains as well.
-    So a payload that pulls the tool across its motion is no friction, although M^-1 couples both.
-    Forces and planes T, the reactions of each contact if it sticks, are columns; the velocity has
-    shape (k, 1).
+    c~ is c without the part that a contact force orthogonal to the sliding explains as well. So a
+    payload that pulls the tool across its motion is no friction, although M^-1 couples both.
+    Forces and planes T, the reactions of each contact if it sticks, are columns.
     """
     components = list[ca.SX]()
     for force, plane in zip(ca.horzsplit(forces), planes, strict=True):
@@ -367,17 +355,12 @@ class Lags:
 
         s_0' = k (d - s_0),    s_j' = k (s_(j-1) - s_j),    r = s_n = (k / (s + k))^(n+1) d.
 
-    So r has n derivatives, r^(j) = k^j sum_i (-1)^(j-i) C(j, i) s_(n-i), which do not change if the
-    same number is added to all s. For a constant d,
-
-        r = d (1 - e^(-k t) (1 + k t + ... + (k t)^n / n!)),
-
-    and r follows a ramp with a delay of (n + 1) / k.
+    So r has n derivatives, which do not change if the same number is added to all s. For a constant
+    d, r = d (1 - e^(-k t) (1 + k t + ... + (k t)^n / n!)), and r follows a ramp with a delay of
+    (n + 1) / k.
     The next sample of s is step s + gain d, and slopes s are r', ..., r^(n).
     """
 
-    rate: float
-    degree: int
     step: FloatArray
     gain: FloatArray
     slopes: FloatArray
@@ -387,14 +370,11 @@ class Lags:
         """Returns the lags of rate k, sampled each `period` seconds, with n = `degree`."""
         size = degree + 1
         both = np.zeros((size + 1, size + 1))
-        both[:size, :size] = rate * (np.eye(size, k=-1) - np.eye(size))
+        both[:size, :size] = rates = rate * (np.eye(size, k=-1) - np.eye(size))
         both[0, size] = rate
-        transition = expm(both * period)
-        slopes = np.zeros((degree, size))
-        for j in range(1, size):
-            for i in range(j + 1):
-                slopes[j - 1, degree - i] = rate**j * (-1) ** (j - i) * comb(j, i)
-        return cls(rate, degree, transition[:size, :size], transition[:size, size], slopes)
+        step = expm(both * period)
+        slopes = [np.linalg.matrix_power(rates, j)[-1] for j in range(1, size)]
+        return cls(step[:size, :size], step[:size, size], np.reshape(slopes, (degree, size)))
 
     def after(self, lags: ca.SX, signal: ca.SX) -> ca.SX:
         """Returns s at the next sample for d of shape (k, 1), one column for each, (k, n + 1)."""
@@ -405,9 +385,10 @@ class Lags:
         return ca.mtimes(lags, self.slopes.T)
 
 
-@dataclass(frozen=True, eq=False)
-class ChainFilter:
-    """The stationary Kalman filter of (q, v, a) from samples of q, and of v if it is measured:
+def filter_gain(
+    state_rate: float, disturbance_rate: float, period: float, velocity_ratio: float | None = None
+) -> FloatArray:
+    """Returns K of the stationary Kalman filter of (q, v, a) from samples of q, and of v if known:
 
         q' = v,    v' = known acceleration + a + white noise,    a' = white noise,
 
@@ -416,46 +397,29 @@ class ChainFilter:
         prediction:   q = q + T v + T^2 / 2 a,   v = v + T (known acceleration + a),
         correction:   (q, v, a) = (q, v, a) + K (measured - predicted).
 
-    With the noise R = T sigma^2 of positions, that of v' is R w^4 and that of a' is R w^4 k_o^2.
+    With the noise R = T sigma^2 of positions, that of v' is R w^4 and that of a' is R w^4 k_o^2,
+    for a state_rate w and a disturbance_rate k_o; velocity_ratio is sigma_v / sigma.
     Without measured velocities the poles solve s^6 + w^4 s^2 - w^4 k_o^2 = 0, up to terms of the
     order of w T (Kwakernaak and Sivan, Linear Optimal Control Systems, 1972, theorem 4.14): for
     k_o << w a pair at the distance w, for the velocity, and one at -k_o, for the model error a.
-    `covariance` is that of (q, v, a) after a correction, relative to sigma^2.
     """
-
-    gain: FloatArray
-    covariance: FloatArray
-    period: float
-
-    @classmethod
-    def of(
-        cls,
-        state_rate: float,
-        disturbance_rate: float,
-        period: float,
-        velocity_ratio: float | None = None,
-    ) -> "ChainFilter":
-        """Designs the filter for w and k_o, and for sigma_v / sigma if velocities are measured."""
-        w, slow = positive("state_rate", state_rate), positive("disturbance_rate", disturbance_rate)
-        if w * positive("period", period) > 1.0:
-            raise ModelError(
-                f"a state_rate of {w:g} 1/s is too high for samples {period:g} s apart: at most "
-                f"{1.0 / period:g} 1/s"
-            )
-        # Scaled: q, T v, T^2 a in units of sigma.
-        size = period ** np.arange(3)
-        step = size[:, None] * transition(period) / size
-        noise = np.diag([0.0, (w * period) ** 4, (w * period) ** 4 * (slow * period) ** 2])
-        shown = np.eye(3)[:1] if velocity_ratio is None else np.eye(3)[:2]
-        error = np.eye(len(shown))
-        if velocity_ratio is not None:
-            error[1, 1] = (positive("velocity_ratio", velocity_ratio) * period) ** 2
-        before = solve_discrete_are(step.T, shown.T, noise, error)
-        gain = np.linalg.solve(shown @ before @ shown.T + error, shown @ before).T
-        after = before - gain @ shown @ before
-        both = np.outer(1.0 / size, 1.0 / size)
-        units = size[: len(shown)] / size[:, None]
-        return cls(gain * units, after * both, period)
+    w, slow = positive("state_rate", state_rate), positive("disturbance_rate", disturbance_rate)
+    if w * positive("period", period) > 1.0:
+        raise ModelError(
+            f"a state_rate of {w:g} 1/s is too high for samples {period:g} s apart: at most "
+            f"{1.0 / period:g} 1/s"
+        )
+    # Scaled: q, T v, T^2 a in units of sigma.
+    size = period ** np.arange(3)
+    step = size[:, None] * transition(period) / size
+    noise = np.diag([0.0, (w * period) ** 4, (w * period) ** 4 * (slow * period) ** 2])
+    shown = np.eye(3)[:1] if velocity_ratio is None else np.eye(3)[:2]
+    error = np.eye(len(shown))
+    if velocity_ratio is not None:
+        error[1, 1] = (positive("velocity_ratio", velocity_ratio) * period) ** 2
+    before = solve_discrete_are(step.T, shown.T, noise, error)
+    gain = np.linalg.solve(shown @ before @ shown.T + error, shown @ before).T
+    return np.asarray(gain * size[: len(shown)] / size[:, None])
 
 
 def transition(period: float) -> FloatArray:

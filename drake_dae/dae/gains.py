@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -68,12 +68,11 @@ class FeedbackGains:
     @checked(GainError)
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
         """Returns the exact tracking error exp(E t) e(0) of (30), (31), shape (k, p)."""
-        moments, matrix = vector("times", np.atleast_1d(times), None, GainError), self.error_matrix
-        coordinates = numbers("initial", initial, GainError)
-        if coordinates.shape != (len(matrix),):
-            raise GainError(
-                f"the error has {len(matrix)} coordinates, got shape {coordinates.shape}"
-            )
+        moments = vector("times", np.atleast_1d(times), None, GainError)
+        coordinates = vector("initial", initial, self.layout.chain_size, GainError)
+        result = np.zeros((moments.size, len(self.degrees)))
+        if not coordinates.size:
+            return result
         # From one time to the next: a log with fixed steps has few different step lengths once its
         # times are rounded to a power of 2, whose differences floating-point numbers compute
         # exactly.
@@ -81,28 +80,18 @@ class FeedbackGains:
         order = np.argsort(moments)
         steps = np.diff(np.round(moments[order] / grid) * grid, prepend=0.0)
         lengths, which = np.unique(steps, return_inverse=True)
-        result = np.zeros((moments.size, len(self.degrees)))  # (31), (34)
-        orders, owner = self.layout.orders, self.layout.owners
-        for outputs in _coupled(self.layout, self.matrix):
-            rows = np.flatnonzero(np.isin(owner, outputs))
-            block = matrix[np.ix_(rows, rows)]
-            # In units of its own rate, a power of 2, so that the entries of exp(E t) have similar
-            # sizes.
-            rate = np.exp2(np.round(np.log2(np.max(np.abs(np.linalg.eigvals(block))))))
-            scale = rate ** orders[rows]
-            transitions = scipy.linalg.expm(
-                lengths[:, None, None] * (block / scale[:, None] * scale)
-            )
-            current = coordinates[rows] / scale
-            response = np.zeros((moments.size, rows.size))
-            for row, index in zip(order, which, strict=True):
-                current = transitions[index] @ current
-                response[row] = current
-            result[:, owner[rows[orders[rows] == 0]]] = response[:, orders[rows] == 0]
+        # In units, powers of 2, in which the entries of E, and so of exp(E t), have similar sizes.
+        balanced, (units, _) = scipy.linalg.matrix_balance(
+            self.error_matrix, permute=False, separate=True
+        )
+        transitions = scipy.linalg.expm(lengths[:, None, None] * balanced)  # (31), (34)
+        rows, current = np.zeros((moments.size, len(units))), coordinates / units
+        for row, index in zip(order, which, strict=True):
+            current = transitions[index] @ current
+            rows[row] = current
+        result[:, self.layout.dynamic] = (rows * units)[:, self.layout.heads]
         return result
 
-
-T = TypeVar("T")
 
 # A function that makes gains for outputs of given names and degrees.
 GainDesign = Callable[[Sequence[str], Sequence[int]], FeedbackGains]
@@ -117,13 +106,7 @@ def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
         values: One pole in 1/s for all, or a sequence of mu_i poles for every output, or these per
             output name, "*" for all others. Complex poles come in conjugate pairs.
     """
-
-    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
-        chosen: list[tuple[str, int, Poles]] = _per_output(values, names, degrees)
-        polynomials = {name: _polynomial(name, degree, own) for name, degree, own in chosen}
-        return gain_coefficients(polynomials)(names, degrees)
-
-    return design
+    return _row_by_row(values, _polynomial)
 
 
 @checked(GainError)
@@ -131,23 +114,7 @@ def gain_coefficients(
     values: Sequence[float] | Mapping[str, float | Sequence[float]],
 ) -> GainDesign:
     """Designs the gains K_i1, ..., K_i mu_i of (32) from numbers, lowest derivative first."""
-
-    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
-        matrix, owners = np.zeros((len(names), sum(degrees))), DerivativeLayout(degrees).owners
-        chosen: list[tuple[str, int, float | Sequence[float]]]
-        chosen = _per_output(values, names, degrees)
-        for name, degree, row in chosen:
-            entries = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
-            if entries.shape != (degree,):
-                raise GainError(
-                    f"output '{name}' has degree {degree} and takes {degree} coefficients "
-                    f"K_i1, ..., K_i{degree}, got {entries.size}"
-                )
-            i = list(names).index(name)
-            matrix[i, owners == i] = entries
-        return FeedbackGains(tuple(names), tuple(degrees), matrix)
-
-    return design
+    return _row_by_row(values, _coefficients)
 
 
 def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
@@ -197,25 +164,32 @@ def designed(
     return gains
 
 
-def _per_output(
-    values: T | Mapping[str, T], names: Sequence[str], degrees: Sequence[int]
-) -> list[tuple[str, int, T]]:
-    """Returns name, degree and value of each output with a degree above 0."""
-    dynamic = [(name, degree) for name, degree in zip(names, degrees, strict=True) if degree]
-    if not isinstance(values, Mapping):
-        return [(name, degree, values) for name, degree in dynamic]
-    expected = [name for name, _ in dynamic]
-    wrong = [name for name in values if name not in (*expected, "*")]
-    missing = [name for name in expected if name not in values and "*" not in values]
-    if wrong or missing:
-        raise GainError(
-            f"gains are needed for the outputs {', '.join(expected)}, of degree 1 or more; not "
-            f"given: {', '.join(missing) or 'none'}; others: {', '.join(wrong) or 'none'}"
-        )
-    return [(name, degree, values[name if name in values else "*"]) for name, degree in dynamic]
+def _row_by_row(
+    values: Any, row_of: Callable[[str, int, Any], Sequence[float] | FloatArray]
+) -> GainDesign:
+    """Designs a row of K for each output with a degree above 0, by a value for all or for each."""
+
+    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
+        matrix, owners = np.zeros((len(names), sum(degrees))), DerivativeLayout(degrees).owners
+        needed = {name: degree for name, degree in zip(names, degrees, strict=True) if degree}
+        chosen = values if isinstance(values, Mapping) else {"*": values}
+        wrong = [name for name in chosen if name not in (*needed, "*")]
+        missing = [name for name in needed if name not in chosen and "*" not in chosen]
+        if wrong or missing:
+            raise GainError(
+                f"gains are needed for the outputs {', '.join(needed)}, of degree 1 or more; not "
+                f"given: {', '.join(missing) or 'none'}; others: {', '.join(wrong) or 'none'}"
+            )
+        for i, name in enumerate(names):
+            if name in needed:
+                value = chosen[name if name in chosen else "*"]
+                matrix[i, owners == i] = row_of(name, needed[name], value)
+        return FeedbackGains(tuple(names), tuple(degrees), matrix)
+
+    return design
 
 
-def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
+def _polynomial(name: str, degree: int, chosen: Poles) -> FloatArray:
     """K_i1, ..., K_i mu_i of the polynomial (32) with the chosen roots."""
     roots = np.atleast_1d(np.asarray(chosen, dtype=complex))
     if roots.size == 1:
@@ -227,14 +201,15 @@ def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
     monic = np.poly(roots)  # (32)
     if np.abs(np.imag(monic)).max() > 1e-12 * np.abs(monic).max():
         raise GainError(f"complex poles of output '{name}' must come in conjugate pairs: {roots}")
-    return [float(number) for number in np.real(monic)[:0:-1]]
+    return np.real(monic)[:0:-1]
 
 
-def _coupled(layout: DerivativeLayout, matrix: FloatArray) -> list[list[int]]:
-    """Groups of outputs whose errors are coupled."""
-    groups: list[set[int]] = []
-    for i in map(int, layout.dynamic):
-        joined = {i, *map(int, layout.owners[np.flatnonzero(matrix[i])])}
-        apart = [group for group in groups if not group & joined]
-        groups = [*apart, joined.union(*(group for group in groups if group & joined))]
-    return [sorted(group) for group in groups]
+def _coefficients(name: str, degree: int, chosen: float | Sequence[float]) -> FloatArray:
+    """K_i1, ..., K_i mu_i as they are given."""
+    entries = np.atleast_1d(numbers(f"coefficients of output '{name}'", chosen, GainError))
+    if entries.shape != (degree,):
+        raise GainError(
+            f"output '{name}' has degree {degree} and takes {degree} coefficients "
+            f"K_i1, ..., K_i{degree}, got {entries.size}"
+        )
+    return entries

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 
-from drake_dae.arrays import numbers, positive
+from drake_dae.arrays import positive
 from drake_dae.dae.derivatives import Derivatives, eliminate
 from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
 from drake_dae.dae.signals import DerivativeLayout, Signal, places_of
@@ -27,12 +27,9 @@ def law_structure(
         y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0, or the symbol of a deflection,
 
     without a term in y_i itself, which would control the position of the surface instead of the
-    force. On N* all y_i^(j) vanish, so that nothing changes there: alpha (13) becomes alpha - A^-1
-    (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay. With a latency the mass matrix
-    changes: see `acting_late`.
-
-    Where a force is an output of degree mu >= 1, the law takes the added term as constant: along
-    the model its derivatives would destabilize a compliant contact, which moves otherwise.
+    force. On N* nothing changes: alpha (13) becomes alpha - A^-1 (sum_j c_j L_f^j k_i), and beta
+    (14), the degrees, A and B stay. For a force of degree mu >= 1 the added term is taken as
+    constant: its derivatives would destabilize a compliant contact, which moves otherwise.
     """
     system = acting_late(structure.system, latency)
     if damping is None and deflection is None and system is structure.system:
@@ -47,28 +44,22 @@ def law_structure(
         force = force - deflection.symbol
     derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
     # The output chains of the same degrees along these derivatives.
-    degrees = structure.output_degrees
-    chains: list[list[ca.SX]] = [[] for _ in degrees]
-    highest, rows = ca.SX(len(degrees), 1), list(range(len(degrees)))
-    moving = system.outputs(derivatives.constraint_input)
-    for order in range(max(degrees, default=0) + 1):
-        values, _ = derivatives.by_control(moving)
-        for row, i in enumerate(rows):
-            if degrees[i] == order:
-                highest[i] = moving[row]
-            else:
-                chains[i].append(values[row])
-        remaining = [row for row, i in enumerate(rows) if degrees[i] > order]
-        rows = [rows[row] for row in remaining]
-        if rows:
-            moving = derivatives.derivative(moving[remaining])
-    drift, control_matrix = derivatives.by_control(highest)
+    highest, moving = list[ca.SX](), [ca.SX(0, 1)]
+    outputs = system.outputs(derivatives.constraint_input)
+    for row, degree in zip(ca.vertsplit(outputs), structure.output_degrees, strict=True):
+        for _ in range(degree):
+            moving.append(row)
+            row = derivatives.derivative(row)
+        highest.append(row)
+    values = iter(ca.vertsplit(derivatives.by_control(ca.vertcat(*moving))[0]))
+    chains = tuple(tuple(islice(values, degree)) for degree in structure.output_degrees)
+    drift, control_matrix = derivatives.by_control(ca.vertcat(*highest))
     return replace(
         structure,
         derivatives=derivatives,
         elimination=replace(eliminate(derivatives), n_star=structure.elimination.n_star),
-        output_chains=tuple(map(tuple, chains)),
-        highest_derivatives=highest,
+        output_chains=chains,
+        highest_derivatives=ca.vertcat(*highest),
         drift=drift,
         control_matrix=control_matrix,
     )
@@ -90,9 +81,8 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
         M v' + D (v + T v') = u,    or    (M + T D) v' + D v = u.
 
     With M alone the errors of a light joint with T D / M = 30, as in the wrists of some arms, decay
-    30 times as slowly as designed. Drake's discrete MultibodyPlant, whose damping is implicit, adds
-    h / 2 to T. D is -df / dv without Coulomb friction at the nominal speeds, at any position. v are
-    the states that a force or a control drives, if their own damping there is positive.
+    30 times as slowly as designed. D is -df / dv without Coulomb friction at the nominal speeds, at
+    any position; v are the states that a force or a control drives, with a positive damping there.
     """
     if latency < 0.0:
         raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")
@@ -123,45 +113,33 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
 
 
 class ForceMeasurement:
-    """The measurement of v in the law (28), for the outputs z_i = v_j:
+    """The measurement of v in the law (28), for outputs z_i that are one v_j or combinations m_i v:
 
-        mu_i = 0:  ubar_i = r_i - Gbar_j (v - r), the term J^T Gbar (lambda - r_2) of (59). The
-            force error of a wrong model shrinks to 1 / (1 + Gbar).
-        mu_i >= 1: v_j takes the place of the model's l*_i, as (71) and (81) allow.
-
-    For outputs that are combinations, z_i = m_i(x) v, Gbar is a multiple of the identity.
+    mu_i = 0:  ubar_i = r_i - Gbar (z_i - r_i), the term J^T Gbar (lambda - r_2) of (59). The
+        force error of a wrong model shrinks to 1 / (1 + Gbar).
+    mu_i >= 1: z_i takes the place of the model's l*_i, as (71) and (81) allow.
     """
 
-    def __init__(self, system: DaeSystem, layout: DerivativeLayout, gain: ArrayLike) -> None:
+    def __init__(self, system: DaeSystem, layout: DerivativeLayout, gain: float) -> None:
         if system.sharing is not None:
             raise ModelError(
                 f"{system.name}: measured_force is not supported for redundant constraints that "
                 "share their forces; leave them out with `drop_constraints`, or use the law's "
                 "own force"
             )
-        size, matrix = system.num_constraints, numbers("force_gain", gain, GainError)
-        matrix = matrix * np.eye(size) if matrix.ndim == 0 else matrix
-        if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)):
-            raise GainError(f"force_gain must be a number or shape ({size}, {size}), got {gain!r}")
-        smallest = float(np.min(np.linalg.eigvalsh((matrix + matrix.T) / 2.0), initial=0.0))
-        if smallest < -1e-12:
+        if not gain >= 0.0:
             raise GainError(
-                "force_gain, Gbar of (59), must be positive semidefinite: a negative one feeds the "
-                f"force error back with the wrong sign. Smallest eigenvalue {smallest:.3g}"
+                "force_gain, Gbar of (59), must be 0 or more: a negative one feeds the force error "
+                f"back with the wrong sign, got {gain:g}"
             )
-        self.layout, self.gain, self.symbol = layout, matrix, ca.SX.sym("v", size)
-        self.rows, self.inputs = _force_outputs(system)
-        for i in self.rows:
-            name, degree = system.output_signals[i].name, layout.degrees[i]
-            if i not in self.inputs and np.any(matrix != matrix[0, 0] * np.eye(size)):
-                raise GainError(
-                    f"force_gain must be one number, since '{name}' is a combination of forces"
-                )
-            if degree and matrix[self.inputs.get(i, 0)].any():
-                raise GainError(
-                    f"force_gain is for outputs of degree 0; '{name}' has degree {degree} and "
-                    "takes the measured force itself. Leave it 0"
-                )
+        self.layout, self.gain, self.rows = layout, gain, _force_outputs(system)
+        self.symbol = ca.SX.sym("v", system.num_constraints)
+        late = [system.output_signals[i].name for i in self.rows if layout.degrees[i]]
+        if late and gain:
+            raise GainError(
+                f"force_gain is for outputs of degree 0; {', '.join(late)} take the measured "
+                "force itself. Leave it 0"
+            )
 
     def value(self, output: int) -> ca.SX:
         """Returns the measured value of an output, m_i v."""
@@ -176,34 +154,24 @@ class ForceMeasurement:
         return result
 
     def highest(self, highest: ca.SX, values: ca.SX) -> ca.SX:
-        """Returns the highest derivatives of the reference, less Gbar (v - r) where mu_i = 0."""
-        excess = ca.SX(self.symbol.numel(), 1)
-        for i, j in self.inputs.items():
-            excess[j] = self.symbol[j] - values[i]
+        """Returns the highest derivatives of the reference, less Gbar (z - r) where mu_i = 0."""
         result = ca.SX(highest)
-        for i in map(int, self.layout.direct):
-            if i in self.inputs:
-                result[i] -= ca.mtimes(ca.DM(self.gain[self.inputs[i]]).T, excess)  # (59)
-            elif i in self.rows:
-                result[i] -= self.gain[0, 0] * (self.value(i) - values[i])
+        for i in self.rows:
+            if not self.layout.degrees[i]:
+                result[i] -= self.gain * (self.value(i) - values[i])  # (59)
         return result
 
 
-def _force_outputs(system: DaeSystem) -> tuple[dict[int, ca.SX], dict[int, int]]:
-    """The outputs z_i = m_i v, as i -> m_i; and those that are one input, z_i = v_j, as i -> j."""
-    rows, single = dict[int, ca.SX](), dict[int, int]()
-    for i in range(system.num_outputs):
-        row = ca.sparsify(system.m[i, :])
-        if system.l[i].is_zero() and row.nnz():
-            rows[i], columns = row, row.sparsity().get_triplet()[1]
-            if len(columns) == 1 and row[columns[0]].is_one():
-                single[i] = columns[0]
-    if not rows:
+def _force_outputs(system: DaeSystem) -> dict[int, ca.SX]:
+    """The outputs z_i = m_i v, as i -> m_i."""
+    rows = {i: ca.sparsify(system.m[i, :]) for i in range(system.num_outputs)}
+    found = {i: row for i, row in rows.items() if row.nnz() and system.l[i].is_zero()}
+    if not found:
         raise ModelError(
             f"{system.name}: measured_force needs an output that is a constraint input or a "
             "combination of some"
         )
-    return rows, single
+    return found
 
 
 class IntegralAction:
@@ -223,10 +191,7 @@ class IntegralAction:
         names: Sequence[str],
         measured: ForceMeasurement | None,
     ) -> None:
-        try:
-            chosen = places_of("output", names, system.output_signals, "integral: ")
-        except ModelError as error:
-            raise GainError(str(error)) from None
+        chosen = places_of("output", names, system.output_signals, "integral: ")
         for i, name in zip(chosen, names, strict=True):
             if chosen.count(i) > 1:
                 raise GainError(f"integral: '{name}' occurs twice")
@@ -271,9 +236,9 @@ class Deflection:
 
         phi'' + c phi' = phi_d'' + c phi_d' = -(lambda_d'' + c lambda_d') / k,
 
-    so that e = phi - phi_d obeys e'' + c e' + A k e = 0 for any reference that is twice
-    differentiable, and friction is that of lambda_d. A stiffness that is wrong by a factor s leaves
-    |1 - s| of the oscillation. `symbol` stands for the right side, and is zero on N*.
+    so that e = phi - phi_d obeys e'' + c e' + A k e = 0, and friction is that of lambda_d. A
+    stiffness that is wrong by a factor s leaves |1 - s| of the oscillation. `symbol` stands for the
+    right side, and is zero on N*.
     """
 
     def __init__(
@@ -281,7 +246,12 @@ class Deflection:
     ) -> None:
         system, size = structure.system, structure.system.num_constraints
         self.stiffness = positive("contact_stiffness", stiffness)
-        self.inputs = _force_outputs(system)[1]
+        # The outputs z_i = v_j, as i -> j.
+        self.inputs = {
+            i: columns[0]
+            for i, row in _force_outputs(system).items()
+            if len(columns := row.sparsity().get_triplet()[1]) == 1 and row[columns[0]].is_one()
+        }
         degrees = [structure.output_degrees[i] for i in self.inputs]
         if sorted(self.inputs.values()) != list(range(size)) or any(degrees) or not size:
             raise ModelError(
@@ -298,9 +268,6 @@ class Deflection:
 
     def wanted(self, reference: ca.SX, layout: DerivativeLayout) -> ca.SX:
         """-(lambda_d'' + c lambda_d') / k of each constraint, shape (m, 1)."""
-        outputs, columns = list(self.inputs), list(self.inputs.values())
-        first, second = (ca.SX.zeros(len(columns)) for _ in range(2))
-        places = layout.lowest[outputs]
-        first[columns] = reference[(places + 1).tolist()]
-        second[columns] = reference[(places + 2).tolist()]
+        places = layout.lowest[sorted(self.inputs, key=self.inputs.__getitem__)]
+        first, second = reference[(places + 1).tolist()], reference[(places + 2).tolist()]
         return -(second + ca.mtimes(self._damping, first)) / self.stiffness

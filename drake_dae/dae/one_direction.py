@@ -1,6 +1,5 @@
 """The sampled loop of a law in one direction, as a linear system driven by noise."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -8,7 +7,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.disturbance import ChainFilter, transition
+from drake_dae.dae.disturbance import filter_gain, transition
 
 
 @dataclass(frozen=True)
@@ -30,21 +29,6 @@ class SensorNoise:
 
 
 @dataclass(frozen=True)
-class Direction:
-    """The motion in one direction, sampled each `period` seconds and delayed by some samples.
-
-    `mobility` is the acceleration per force in the model of the law, `mass_error` the true one
-    relative to it; `stiffness` in N/m is 0 in a free direction.
-    """
-
-    period: float
-    delay: int
-    mobility: float = 1.0
-    stiffness: float = 0.0
-    mass_error: float = 1.0
-
-
-@dataclass(frozen=True)
 class DirectionGains:
     """The gains of a law and its observer in a direction, in 1/s.
 
@@ -56,12 +40,6 @@ class DirectionGains:
     force_gain: float
     observer_rate: float
     state_rate: float | None = None
-
-    @property
-    def poles(self) -> tuple[float, float]:
-        """p and zeta of `pole_gains`."""
-        p = self.gains[0] ** (1.0 / 3.0)
-        return p, (self.gains[2] / p - 1.0) / 2.0
 
 
 @dataclass(frozen=True)
@@ -111,13 +89,22 @@ class SampledLoop:
         return float(max(rest @ spread @ rest, 0.0)) ** 0.5
 
 
-def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise) -> SampledLoop:
-    """Returns the loop of a law whose model is right, except for the `mass_error`.
+def sampled_loop(
+    rates: DirectionGains,
+    noise: SensorNoise,
+    period: float,
+    delay: int,
+    mobility: float = 1.0,
+    stiffness: float = 0.0,
+    mass_error: float = 1.0,
+) -> SampledLoop:
+    """Returns the loop of a law in one direction, sampled each `period` seconds and delayed.
 
     In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
-    commands, held for a sample after its delay, and m the mass_error. In a contact the depth moves
-    as phi'' = m (a - A k phi) + d, and the law measures the force -k phi. With the estimates
-    e, e' and d of observer or estimator the law commands
+    commands, held for a sample after its delay of some samples, and m the mass_error: what a force
+    accelerates, relative to the law's model. In a contact of the stiffness k the depth moves as
+    phi'' = m (a - A k phi) + d, and the law measures the force -k phi. With the estimates e, e' and
+    d of observer or estimator the law commands
 
         a = -K_1 sigma - K_2 e - K_3 e' - d            free,
         a = -c phi' - A K_i sigma_F - d                in a contact,
@@ -131,119 +118,71 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
 
     P = s^3 + K_3 s^2 + K_2 s + K_1, of the variance T sigma_n^2 / (2 pi) int |e/n|^2 dw.
     """
-    parts = ["e", "v", "sum", *(f"held{i}" for i in range(direction.delay))]
+    T, mass, A, stiff = period, mass_error, mobility, mobility * stiffness
+    K_1, K_2, K_3 = rates.gains
+    held = [f"held{i}" for i in range(delay)]
+    parts = ["e", "v", "sum", *held]
     parts += ["q", "w", "a"] if rates.state_rate else ["r", "before", "acted"]
     parts += ["difference", "measured"] if noise.velocity_bandwidth else []
-    kinds = ["position", "velocity", "force", "held"]
-    size, count = len(parts), len(parts) + 3
     # Each quantity is a row of its dependence on the state, the three noises and the disturbance.
-    rows = dict(zip([*parts, *kinds], np.eye(count + 1), strict=True))
-    after, shown = _step(direction, rates, noise, rows)
-    # In units of e, e / T and e / T^2, so that all parts are of one size.
-    orders = {**_ORDERS, "sum": 1 if direction.stiffness else -1}
-    units = direction.period ** np.array([orders.get(name, 2) for name in parts])
-    both = np.array([after[name] for name in parts]) * units[:, None]
-    both[:, :size] /= units
-    looked = np.array([row[:count] for row in shown])
-    looked[:, :size] /= units
-    return SampledLoop(
-        both[:, :size], both[:, size:count], looked, both[:, count], direction.period
-    )
-
-
-_ORDERS = {"e": 0, "q": 0, "measured": 0, "v": 1, "w": 1, "before": 1, "difference": 1}
-"""The order of the derivative that each part is; others are accelerations."""
-
-
-Rows = dict[str, FloatArray]
-
-
-def _step(
-    direction: Direction, rates: DirectionGains, noise: SensorNoise, now: Rows
-) -> tuple[Rows, tuple[FloatArray, FloatArray]]:
-    """The quantities at the next sample; and the error, and the commanded acceleration."""
-    period, mass = direction.period, direction.mass_error
-    stiff = direction.mobility * direction.stiffness
+    size, count = len(parts), len(parts) + 3
+    names = [*parts, "position", "velocity", "force", "push"]
+    now = dict(zip(names, np.eye(count + 1), strict=True))
     after = dict(now)
+
+    # What is measured.
     position = now["e"] + noise.position * now["position"]
     velocity = now["v"] + noise.velocity * now["velocity"]
     if noise.velocity_bandwidth:
-        a = np.exp(-noise.velocity_bandwidth * period)
-        rise = (position - now["measured"]) / period
-        velocity = a * now["difference"] + (1.0 - a) * rise
+        kept = np.exp(-noise.velocity_bandwidth * T)
+        velocity = kept * now["difference"] + (1.0 - kept) / T * (position - now["measured"])
         after |= {"difference": velocity, "measured": position}
-    pressed = -stiff * now["e"] + direction.mobility * noise.force * now["force"]
+    felt = bool(stiff) * A * noise.force * now["force"]
 
-    estimates, update = (_estimated if rates.state_rate else _observed)(rates, period, noise, now)
-    error, rate, disturbance = estimates(position, velocity)
+    # The estimates of e, e' and d: by the estimator, or by the observer, with exact velocities.
+    error, rate, disturbance = position, velocity, now["r" if "r" in now else "a"]
+    if rates.state_rate:
+        ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
+        gain = _filter(rates.state_rate, rates.observer_rate, T, ratio)
+        ahead = np.array([now["q"], now["w"], now["a"]])
+        new = np.array([position, velocity])[: gain.shape[1]] - ahead[: gain.shape[1]]
+        error, rate, disturbance = estimated = ahead + gain @ new
+
+    # The law, and the motion over the sample, exact for what is held.
     if stiff:
-        command = -rates.gains[2] * rate - rates.force_gain * now["sum"] - disturbance
-        after["sum"] = now["sum"] - period * pressed
+        command = -K_3 * rate - rates.force_gain * now["sum"] - disturbance
+        after["sum"] = now["sum"] + T * (stiff * now["e"] - felt)
     else:
-        gains = rates.gains
-        command = -gains[0] * now["sum"] - gains[1] * error - gains[2] * rate - disturbance
-        after["sum"] = now["sum"] + period * error
-    pending = [now[f"held{i}"] for i in range(direction.delay)] + [command]
-    acts = pending[0]
-    for i in range(direction.delay):
-        after[f"held{i}"] = pending[i + 1]
-
-    # The motion over the sample, exact for what is held.
-    push = mass * acts + now["held"]
-    w = (mass * stiff) ** 0.5
-    c, s = np.cos(w * period), np.sinc(w * period / np.pi) * period
-    half = (1.0 - c) / w**2 if w else period**2 / 2.0
+        command = -K_1 * now["sum"] - K_2 * error - K_3 * rate - disturbance
+        after["sum"] = now["sum"] + T * error
+    acts, *after_held = [*(now[name] for name in held), command]
+    after |= dict(zip(held, after_held, strict=True))
+    w, push = (mass * stiff) ** 0.5, mass * acts + now["push"]
+    c, s = np.cos(w * T), np.sinc(w * T / np.pi) * T
+    half = (1.0 - c) / w**2 if w else T**2 / 2.0
     after["e"] = c * now["e"] + s * now["v"] + half * push
     after["v"] = -(w**2) * s * now["e"] + c * now["v"] + s * push
-    mean = -stiff * (now["e"] + after["e"]) / 2.0 if stiff else 0.0 * push
-    mean = mean + direction.mobility * noise.force * now["force"] * bool(stiff)
-    after |= update(position, velocity, acts + mean)
-    force = -direction.stiffness * now["e"] if stiff else now["e"]
-    return after, (force, command)
+
+    # What the model expects to follow: of a contact with the mean force.
+    acted = acts - stiff * (now["e"] + after["e"]) / 2.0 + felt
+    if rates.state_rate:
+        predicted = transition(T) @ estimated + np.outer([T**2 / 2.0, T, 0.0], acted)
+        after |= dict(zip(["q", "w", "a"], predicted, strict=True))
+    else:
+        d = (velocity - now["before"]) / T - now["acted"]
+        after["r"] = now["r"] - np.expm1(-rates.observer_rate * T) * (d - now["r"])
+        after |= {"before": velocity, "acted": acted}
+
+    # In units of e, e / T and e / T^2, so that all parts are of one size.
+    orders = {"e": 0, "q": 0, "measured": 0, "v": 1, "w": 1, "before": 1, "difference": 1}
+    orders["sum"] = 1 if stiff else -1
+    units = T ** np.array([orders.get(name, 2) for name in parts])
+    both = np.array([after[name] for name in parts]) * units[:, None]
+    shown = np.array([-stiffness * now["e"] if stiff else now["e"], command])[:, :count]
+    both[:, :size] /= units
+    shown[:, :size] /= units
+    return SampledLoop(both[:, :size], both[:, size:count], shown, both[:, count], T)
 
 
-_filter = lru_cache(maxsize=256)(ChainFilter.of)
+_filter = lru_cache(maxsize=256)(filter_gain)
 """The same filter serves all masses and stiffnesses."""
-
-Known = Callable[[FloatArray, FloatArray], tuple[FloatArray, ...]]
-Update = Callable[[FloatArray, FloatArray, FloatArray], Rows]
-
-
-def _observed(
-    rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
-) -> tuple[Known, Update]:
-    """With exact velocities: the estimates that the law reads, and the next state."""
-    gain = -np.expm1(-rates.observer_rate * period)
-
-    def estimates(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
-        return position, velocity, now["r"]
-
-    def update(position: FloatArray, velocity: FloatArray, acted: FloatArray) -> Rows:
-        d = (velocity - now["before"]) / period - now["acted"]
-        return {"r": now["r"] + gain * (d - now["r"]), "before": velocity, "acted": acted}
-
-    return estimates, update
-
-
-def _estimated(
-    rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
-) -> tuple[Known, Update]:
-    """With a state_rate: the same; q, w and a are the prediction."""
-    ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
-    assert rates.state_rate is not None
-    observer = _filter(rates.state_rate, rates.observer_rate, period, ratio)
-    ahead = np.array([now["q"], now["w"], now["a"]])
-
-    def corrected(position: FloatArray, velocity: FloatArray) -> FloatArray:
-        measured = np.array([position, velocity][: observer.gain.shape[1]])
-        result: FloatArray = ahead + observer.gain @ (measured - ahead[: len(measured)])
-        return result
-
-    def estimates(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
-        return tuple(corrected(position, velocity))
-
-    def update(position: FloatArray, velocity: FloatArray, acted: FloatArray) -> Rows:
-        q, w, a = transition(period) @ corrected(position, velocity)
-        return {"q": q + period**2 / 2.0 * acted, "w": w + period * acted, "a": a}
-
-    return estimates, update

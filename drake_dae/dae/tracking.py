@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, listed, numbers, vector
+from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
 from drake_dae.dae.law_model import Deflection, ForceMeasurement, IntegralAction, law_structure
 from drake_dae.dae.signals import DerivativeLayout, Signal
@@ -38,8 +38,7 @@ class TrackingLaw:
         gains: A design such as `poles(-4.0)`, or finished gains.
         structure: The structure of the system; found if None.
         measured_force: Whether the law takes a measurement of v: see `ForceMeasurement`.
-        force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
-            semidefinite; only with measured_force.
+        force_gain: Gbar of (59) for the outputs with mu_i = 0, 0 or more; only with measured_force.
         constraint_damping: Damping of constraints that the plant may violate, such as a compliant
             contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi': see
             `law_structure`.
@@ -68,7 +67,7 @@ class TrackingLaw:
         *,
         structure: Structure | None = None,
         measured_force: bool = False,
-        force_gain: ArrayLike = 0.0,
+        force_gain: float = 0.0,
         constraint_damping: GainDesign | FeedbackGains | None = None,
         integral: Sequence[str] = (),
         contact_stiffness: float | None = None,
@@ -85,7 +84,7 @@ class TrackingLaw:
         )
         self.layout = DerivativeLayout(self.structure.output_degrees, more)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
-        if not measured_force and numbers("force_gain", force_gain, GainError).any():
+        if force_gain and not measured_force:
             raise GainError("force_gain needs measured_force=True")
         self.measured_force: ForceMeasurement | None = None
         if measured_force:
@@ -125,11 +124,9 @@ class TrackingLaw:
             outputs["integral_rate"] = self.integral.rate(chain, values)
         # The initial value of (30).
         start = self.integral.coordinates(own - reference[layout.chained.tolist(), :])
+        names = {"reference": reference, "integral": self.integral.symbol}
         self.coordinates_function = self.system.trace(
-            "error coordinates",
-            {"coordinates": start},
-            {"reference": reference, "integral": self.integral.symbol},
-            often=False,
+            "error coordinates", {"coordinates": start}, names, often=False
         )
         parameters = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         self._ubar, self.outputs, self.pivot = ubar, outputs, pivot
@@ -230,12 +227,8 @@ class TrackingLaw:
         """
         measured = [] if measured_force is None else [measured_force]
         if self.integral.outputs:
-            measured.append(self._integrals(integral))
+            measured.append(np.zeros(len(self.integral.outputs)) if integral is None else integral)
         return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
-
-    def _integrals(self, integral: ArrayLike | None) -> FloatArray:
-        size = len(self.integral.outputs)
-        return vector("integral", np.zeros(size) if integral is None else integral, size, GainError)
 
     def error_coordinates(
         self,
@@ -248,7 +241,8 @@ class TrackingLaw:
 
         The integral of an error stands before it; the arguments are those of `control`.
         """
-        values, sigma = self.system.parameter_vector(parameters), self._integrals(integral)
+        values = self.system.parameter_vector(parameters)
+        sigma = np.zeros(len(self.integral.outputs)) if integral is None else integral
         return self.coordinates_function(state, reference, sigma, values)[0]
 
     def predicted_error(

@@ -35,7 +35,7 @@ from drake_dae.diagrams.parts import (
     misfits,
 )
 from drake_dae.diagrams.parts import encoder_seed as seed_of_encoders
-from drake_dae.diagrams.record import Record, Recorded, computed_record
+from drake_dae.diagrams.record import Record, Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, WiringError
 from drake_dae.references import Reference, references_by_name
 from drake_dae.scene.view import add_live_view
@@ -130,7 +130,7 @@ class ClosedLoop:
         """
         context_in(self.plant, context)  # The log has no name.
         logged = Record.from_log(self.log, self.signals, context, after)
-        return self.with_errors(logged).while_finite()
+        return self.with_errors(logged)
 
     @checked(WiringError)
     def with_errors(self, record: Record) -> Record:
@@ -138,7 +138,7 @@ class ClosedLoop:
         values = {name: recorded.values for name, recorded in record.signals.items()}
         derived = self.controller.derived(values)
         added = {name: Recorded(v, signals) for name, (v, signals) in derived.items()}
-        return computed_record(record.time, {**record.signals, **added})
+        return Record(record.time, {**record.signals, **added})
 
     @checked(WiringError)
     def plant_parameters(self, record: Record, context: Context) -> FloatArray:
@@ -189,12 +189,11 @@ def make_closed_loop(
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order; or name
             -> reference, as `references_by_name` takes them.
-        settings: Sensors, drives, sampling and other parts of the loop; none if None.
+        settings: Sensors, drives, sampling and other parts of the loop.
         scene_graph: The scene graph with which the robot's MultibodyPlant was registered before
-            parsing, for drawings of its geometry; None without drawings.
+            parsing, for drawings of its geometry.
         meshcat: The Meshcat for a live view of surfaces, contact forces, and the robot if there is
-            a scene_graph: `FRAME_RATE` times a second, which shortens the integrator's steps. None
-            for no live view; `make_animation` does not need it.
+            a scene_graph: `FRAME_RATE` times a second, which shortens the integrator's steps.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics are unstable; see `TrackingController`.
@@ -213,7 +212,7 @@ def make_closed_loop(
     else:
         reference = ReferenceGenerator(references, degrees)
     try:
-        outputs = law.layout.values(reference.reference(settings.start_time))
+        outputs = law.layout.values(reference.reference(0.0))
     except DrakeDaeError:
         outputs = None  # A trajectory that starts later.
     period = settings.period(plant.time_step)
@@ -329,7 +328,7 @@ def wire_loop(
         connect(force, controller, "measured_force")
         if controller.HasOutputPort("tared_force"):
             force = controller.GetOutputPort("tared_force")
-    if observer is not None and observer.HasInputPort("measured_force"):
+    if observer is not None:
         connect(force, observer, "measured_force")
 
     # Every signal has its own name: it is exported, and logged at each step.

@@ -45,8 +45,6 @@ class LoopSettings:
         signals: Name -> reference of a signal for which phases of a task wait; the signal is set
             where it is above 1/2. Any other is an input port signal_<name> of the loop.
         commanded: Whether references and exogenous signals are `CommandedReferences`.
-        start_time: The start of a run in s, for the references at which the stability of the zero
-            dynamics is judged.
     """
 
     sensor: ForceSensor | None = None
@@ -58,7 +56,6 @@ class LoopSettings:
     plant_exogenous: Sequence[Reference] | None = None
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
     commanded: bool = False
-    start_time: float = 0.0
 
     def period(self, step: float) -> float:
         """The time between samples of the law in s, on a plant with such a step; 0 for none."""
@@ -70,28 +67,25 @@ def misfits(
 ) -> Iterator[str]:
     """What does not fit together, for messages; Drake would name only the ports."""
     encoders, observer, measured = parts.encoders, parts.observer, controller.law.measured_force
-    if controller.HasInputPort("reference") and reference is None:
+    if (takes := controller.HasInputPort("reference")) and reference is None:
         remedy = "ReferenceGenerator(references, controller.law.layout.reference_degrees)"
         yield f"{controller.get_name()} needs a {remedy}"
-    if reference is not None and not controller.HasInputPort("reference"):
+    if reference is not None and not takes:
         yield f"{controller.get_name()} plans its references itself: leave `reference` out"
     if parts.sensor is not None and not controller.HasInputPort("measured_force"):
         yield "the law takes no measured force; make it with measured_force=True"
     if observer is None:
         return
-    plans = controller.HasOutputPort("contact_reference")
-    estimates = observer.state_rate is not None
     if not parts.period(plant.time_step):
         yield "an observer observes at samples: take a sampling=Sampling(period) or a ContactPlant"
-    remedy = "make the law with measured_force=True (in a scenario: sensors.force)"
-    if plant.dae.num_constraints and not (measured or estimates):
-        or_state = "or give the observer a state_rate and the loop encoders"
-        yield f"an observer needs the measured force: {remedy}, {or_state}"
-    if plans and not measured:
-        yield f"the observer of a task needs the measured force, as its contact opens: {remedy}"
-    if estimates and encoders is None:
+    if plant.dae.num_constraints and not measured:
+        remedy = "make the law with measured_force=True (in a scenario: sensors.force)"
+        yield f"an observer needs the measured force: {remedy}"
+    if observer.state_rate is None:
+        return
+    if encoders is None:
         yield "a state_rate is for encoders, whose noise the observer filters: give the loop some"
-    if estimates and encoders is not None and encoders.velocity_bandwidth is not None:
+    elif encoders.velocity_bandwidth is not None:
         yield "an observer with a state_rate takes positions alone: leave velocity_bandwidth out"
 
 
@@ -105,20 +99,22 @@ def check_force_loop(
     sample multiplies the error by the largest root, in magnitude, of
     z^(d + 1) - a z^d + (1 - a) Gbar = 0.
     """
-    force, measured = plant.GetOutputPort("constraint_force"), controller.law.measured_force
-    acts = plant.GetInputPort("control").get_index()
-    at_once = plant.HasDirectFeedthrough(acts, force.get_index())
-    reads = controller.GetInputPort("measured_force").get_index()
-    answers = controller.GetOutputPort("control").get_index()
-    is_direct = at_once and controller.HasDirectFeedthrough(reads, answers)
-    if is_direct and sensor is None and sampling is None:
-        raise WiringError(
-            "the constraint force depends on the control in the same instant, so a law that reads "
-            "it closes an algebraic loop; pass a sensor=ForceSensor(...) with a time_constant or a "
-            "sample_period, or a sampling"
-        )
-    gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
-    lag, samples = (sensor.time_constant, sensor.sample_period) if sensor is not None else (0, 0)
+
+    def feeds(system: System, into: str, out: str) -> bool:
+        ports = system.GetInputPort(into), system.GetOutputPort(out)
+        return bool(system.HasDirectFeedthrough(*(port.get_index() for port in ports)))
+
+    at_once, measured = feeds(plant, "control", "constraint_force"), controller.law.measured_force
+    if sensor is None:
+        if at_once and feeds(controller, "measured_force", "control"):
+            raise WiringError(
+                "the constraint force depends on the control in the same instant, so a law that "
+                "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "
+                "time_constant or a sample_period"
+            )
+        return
+    gain = measured.gain if measured else 0.0
+    lag, samples = sensor.time_constant, sensor.sample_period
     loops = [(samples, 0)] if samples else []
     if sampling is not None and at_once:
         # The law reads what a sensor samples at the same instant one sample later.
@@ -130,7 +126,7 @@ def check_force_loop(
         polynomial[-1] += (1.0 - a) * gain
         if (radius := np.max(np.abs(np.roots(polynomial)), initial=0.0)) >= 1.0:
             raise WiringError(
-                f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample of "
+                f"the sampled force loop diverges: with Gbar = {gain:.3g} each sample of "
                 f"{period:g} s multiplies the force error by {radius:.3g}. Lower force_gain, or "
                 "give the sensor a time_constant well above the period of samples and the delay"
             )

@@ -22,23 +22,11 @@ from drake_dae.errors import ModelError
 from drake_dae.files import MOST_RECORDED, check_file, open_file
 
 
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """A vector signal over time, with the name and unit of each column."""
+class Recorded(NamedTuple):
+    """A vector signal over time, one row for each, with the name and unit of each column."""
 
-    values: FloatArray  # one row per time, shape (k, size)
+    values: FloatArray
     signals: tuple[Signal, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "values", numbers("the values of a signal", self.values))
-        object.__setattr__(self, "signals", tuple(self.signals))
-
-
-def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Record":
-    """A record that the library itself has computed, made without checks of the arguments."""
-    record = object.__new__(Record)
-    vars(record).update(time=time, signals=signals, about={})
-    return record
 
 
 @checked(ModelError)
@@ -61,12 +49,11 @@ class Record:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        time = numbers("the times of a record", self.time)
-        object.__setattr__(self, "time", time)
-        if time.ndim != 1 or np.any(np.diff(time) <= 0.0):
+        object.__setattr__(self, "time", numbers("the times of a record", self.time))
+        if self.time.ndim != 1 or np.any(np.diff(self.time) <= 0.0):
             raise ModelError("the times of a record must be strictly increasing numbers")
         for name, recorded in self.signals.items():
-            shape, wanted = np.shape(recorded.values), (time.size, len(recorded.signals))
+            shape, wanted = np.shape(recorded.values), (self.time.size, len(recorded.signals))
             if shape != wanted:
                 raise ModelError(
                     f"'{name}' of a record has shape {shape}; with {wanted[0]} times and "
@@ -95,16 +82,11 @@ class Record:
     @checked(ModelError)
     def after(self, time: float | None) -> Self:
         """The part of the record later than a time in s; the whole record for None."""
-        return self if time is None else self._rows(slice(_first_after(self.time, time), None))
-
-    def while_finite(self) -> Self:
-        """The record up to the first time at which some signal is not finite."""
-        count = _finite_rows(self.time.size, [r.values for r in self.signals.values()])
-        return self if count == self.time.size else self._rows(slice(count))
-
-    def _rows(self, rows: slice) -> Self:
-        cut = {name: Recorded(r.values[rows], r.signals) for name, r in self.signals.items()}
-        return type(self)(self.time[rows], cut, self.about)
+        if time is None:
+            return self
+        first = _first_after(self.time, time)
+        cut = {name: Recorded(r.values[first:], r.signals) for name, r in self.signals.items()}
+        return type(self)(self.time[first:], cut, self.about)
 
     @classmethod
     def from_log(
@@ -124,13 +106,13 @@ class Record:
             raise ModelError(f"the signals of a log have {stops[-1]} names, the log {size} entries")
         time = samples.sample_times()
         first = 0 if after is None else _first_after(time, after)
-        rows = samples.data()[:, first:].T
+        rows, time = samples.data()[:, first:].T, time[first:]
         # The last step of a failed run may have values that are not numbers.
-        finite = _finite_rows(len(rows), [rows])
-        time = time[first : first + finite]
+        good = np.logical_and.accumulate(np.isfinite(rows).all(axis=1))
+        rows, time = rows[good], time[good]
         # The last sample of a time is the one after the projection.
         last = np.append(np.diff(time) > 0.0, True)[: time.size]
-        columns = np.split(rows[:finite][last], stops[1:-1], axis=1)
+        columns = np.split(rows[last], stops[1:-1], axis=1)
         pairs = zip(signals.items(), columns, strict=True)
         found = {n: Recorded(np.ascontiguousarray(v), tuple(each)) for (n, each), v in pairs}
         return cls(time[last], found)
@@ -220,14 +202,6 @@ def versions() -> dict[str, str]:
 
 def _first_after(times: FloatArray, time: float) -> int:
     return int(np.searchsorted(times, time, side="right"))
-
-
-def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
-    """The number of rows before the first one in which some value is not finite."""
-    finite = np.ones(count, bool)
-    for values in columns:
-        finite &= np.isfinite(values).all(axis=1)
-    return count if finite.all() else int(np.argmin(finite))
 
 
 class PhaseSpan(NamedTuple):

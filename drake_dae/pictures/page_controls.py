@@ -85,12 +85,11 @@ def pushes_of(plant: Plant, numbers: Numbers) -> dict[str, int]:
 def _controls_of_plant(loop: ClosedLoop, numbers: Numbers) -> list[Control]:
     """Sliders of frictions, then those of masses, from the tool to the base."""
     plant, known = loop.plant, numbers.of(loop.controller)
-    used = {*plant.further_parameters, *(signal.name for signal in plant.dae.parameter_signals)}
     frictions, masses = list[Control](), list[Control]()
     for name, place in reversed(numbers.of(plant).items()):
         unit, value = numbers.signals[place].unit, float(numbers.values[place])
         places = (place,), (known[name],) if name in known else ()
-        if name.endswith((".friction", ".viscous_friction")) and name in used:
+        if name.endswith((".friction", ".viscous_friction")):
             high = rounded(max(0.6, 2.0 * value))
             frictions.append(Control("plant", name, unit, 0.0, high, value, *places))
         elif name.endswith(".mass") and unit == "kg":

@@ -5,14 +5,16 @@ those of the highest degree (positions rather than forces); or of some of these 
 that order, "tool.yz"; or a list of such names, "tool.y, joint3".
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.arrays import unknown_name
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references.formulas import ConstantReference
 from drake_dae.references.reference import Reference
@@ -27,10 +29,10 @@ class ReferenceRows(Reference):
     rows: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        all_rows = range(self.reference.size)
-        if not self.rows or len(set(self.rows) & set(all_rows)) != len(self.rows):
+        most = self.reference.size - 1
+        if not self.rows or len(set(self.rows) & set(range(most + 1))) != len(self.rows):
             raise ReferenceSignalError(
-                f"rows must be distinct ones of 0 to {all_rows[-1]}, got {self.rows}"
+                f"rows must be distinct ones of 0 to {most}, got {self.rows}"
             )
 
     @property
@@ -41,26 +43,15 @@ class ReferenceRows(Reference):
     def repeats(self) -> float | None:
         return self.reference.repeats
 
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        needed, places = self._of_all_rows(degrees)
-        function = self.reference.derivatives(needed)
-        return lambda time: function(time)[places]
-
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        needed, places = self._of_all_rows(degrees)
-        value = self.reference.expression(needed, time)
-        return None if value is None else value[places]
-
-    def _of_all_rows(self, degrees: Sequence[int]) -> tuple[list[int], list[int]]:
-        """Returns the degree of each row of the whole, and the places of the chosen values."""
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
         degree_of = dict(zip(self.rows, degrees, strict=True))
         needed = [degree_of.get(row, 0) for row in range(self.reference.size)]
-        first = np.cumsum([0, *[degree + 1 for degree in needed]])
-        return needed, [int(first[row]) + k for row in self.rows for k in range(needed[row] + 1)]
+        starts = np.cumsum([0, *(degree + 1 for degree in needed)]).tolist()
+        value = self.reference.expression(needed, time)
+        return ca.vertcat(*(value[starts[row] : starts[row + 1]] for row in self.rows))
 
 
-@dataclass(frozen=True)
-class Assignment:
+class Assignment(NamedTuple):
     """A reference for the outputs that a name denotes, by their indices; it has a row for each."""
 
     name: str
@@ -80,7 +71,7 @@ def assign(
         raise ReferenceSignalError(
             f"{reference.size} value(s) for {len(places)} output(s): {listed}"
         )
-    reference.derivatives([degrees[i] for i in places])
+    reference.expression([degrees[i] for i in places], ca.SX.sym("t"))
     return Assignment(name, reference, places)
 
 
@@ -99,16 +90,12 @@ def in_order(assignments: Sequence[Assignment], outputs: Sequence[str]) -> list[
             f"missing: {', '.join(missing)}; references are needed for {', '.join(outputs)}"
         )
     # Successive rows of one reference stay together.
-    ordered, i = [], 0
-    while i < len(outputs):
-        assignment, row = rows[i]
-        last = row + 1
-        while rows.get(i + last - row) == (assignment, last):
-            last += 1
-        whole = assignment.reference
-        is_whole = last - row == whole.size
-        ordered.append(whole if is_whole else ReferenceRows(whole, tuple(range(row, last))))
-        i += last - row
+    ordered = []
+    ordered_rows = [(i, *rows[i]) for i in range(len(outputs))]
+    for _, run in groupby(ordered_rows, lambda each: (each[1].name, each[2] - each[0])):
+        chosen = list(run)
+        reference, kept = chosen[0][1].reference, tuple(row for _, _, row in chosen)
+        ordered.append(reference if len(kept) == reference.size else ReferenceRows(reference, kept))
     return ordered
 
 

@@ -13,22 +13,23 @@ from drake_dae.arrays import FloatArray, number_in, positive, unknown_name
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.files import read_text
 from drake_dae.references.reference import check_order
-from drake_dae.references.splines import MOST_POINTS, SplineReference, TimeSpline, rounded_up
-
-MOST = 1e15
-"""Larger numbers are refused: a double has no useful digits left."""
+from drake_dae.references.splines import (
+    MOST_POINTS,
+    PiecewisePolynomials,
+    PiecewiseReference,
+    uniform_spline,
+)
 
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
-class CsvReference(SplineReference):
+class CsvReference(PiecewiseReference):
     """A smooth reference from columns of a CSV file; constant before the first and after the last.
 
     Columns are interpolated linearly between rows. The reference is this motion q, averaged over a
     window: a uniform B-spline over q at times that are `smoothing` apart, order + 2 in a window.
-    The deviation from the rows is, to leading order, (order + 2) / 24 smoothing^2 q''; its maximum
-    is `deviation`, and more than `tolerance` is refused. At a kink of q, as on a path of few rows,
-    the deviation is of first order in `smoothing`. Derivatives divide noise by powers of
+    The deviation from the rows is, to leading order, (order + 2) / 24 smoothing^2 q'', and of first
+    order at a kink of q; more than `tolerance` is refused. Derivatives divide noise by powers of
     `smoothing`: choose both numbers for noisy rows. If the velocity of q is not zero at the
     first row, the reference starts half a window before it.
 
@@ -74,70 +75,43 @@ class CsvReference(SplineReference):
         """The times since the first row, and the columns, shape (k, 1 + size)."""
         return _read(Path(self.file), [self.time, *self.columns])
 
-    @cached_property
-    def spline(self) -> TimeSpline:
-        times = self.table[:, 0]
-        if self.smoothing is not None:
-            spline = self._smoothed(self.smoothing)
-        else:
-            spline = self._smoothed(max(float(np.median(np.diff(times))), times[-1] / MOST_POINTS))
-            while (
-                np.any(self._off(spline) > self._allowed) and 2 * len(spline.points) < MOST_POINTS
-            ):
-                spline = self._smoothed(spline.step / 2)
-        off = self._off(spline)
-        if np.any(off > self._allowed):
-            worst = int(np.argmax(off / self._allowed))
-            raise ReferenceSignalError(
-                f"'{self.file}': smoothed over {spline.step:.3g} s the reference is off its rows "
-                f"by {off[worst]:.3g} in '{self.columns[worst]}', and at most "
-                f"{self._allowed[worst]:.3g} is allowed, {self.tolerance:g} of the column's range. "
-                "Choose a smaller smoothing, give more rows where the path turns, or write a "
-                "larger tolerance"
-            )
-        return spline
-
-    def _smoothed(self, step: float) -> TimeSpline:
-        """Returns the spline whose points are `step` seconds apart."""
-        times = self.table[:, 0]
-        count = float(np.ceil(times[-1] / step - 1e-9)) + 1
-        if count > MOST_POINTS + 1:
-            least = times[-1] / MOST_POINTS
-            raise ReferenceSignalError(
-                f"smoothing must be {rounded_up(least)} s or more for {times[-1]:.3g} s, got "
-                f"{step:g} s"
-            )
-        moments = step * np.arange(int(count))
-        points = np.column_stack([np.interp(moments, times, row) for row in self.table.T[1:]])
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
+        points, step = self._smoothed
         # The k-th point has its largest weight at k steps after the first row.
-        return TimeSpline(points, step, self.start_time - self.order / 2 * step, self.order)
-
-    @property
-    def deviation(self) -> FloatArray:
-        """The largest distance of each column's rows from the reference, shape (size,)."""
-        return self._off(self.spline)
-
-    @property
-    def remark(self) -> str:
-        """The deviation from the rows, as text."""
-        pairs = zip(self.columns, self.deviation, strict=True)
-        distances = ", ".join(f"{off:.2g} in {column}" for column, off in pairs)
-        return (
-            f"CsvReference '{Path(self.file).name}': smoothed over {self.spline.step:.3g} s, its "
-            f"largest distances from its rows are {distances}"
-        )
-
-    def _off(self, spline: TimeSpline) -> FloatArray:
-        """The largest deviation of a spline from each column, shape (size,)."""
-        fitted = spline.pieces([0] * self.size).at(self.start_time + self.table[:, 0])
-        return np.abs(fitted - self.table[:, 1:]).max(axis=0)
+        begin = self.start_time - self.order / 2 * step
+        return uniform_spline(points, step, begin, self.order, degrees)
 
     @cached_property
-    def _allowed(self) -> FloatArray:
-        """The allowed deviation of each column; of a constant one, round-off. Shape (size,)."""
-        values = self.table[:, 1:]
+    def _smoothed(self) -> tuple[FloatArray, float]:
+        """The points of the spline, shape (k, size), and the time between them in s."""
+        (times, *columns), values = self.table.T, self.table[:, 1:]
+        # The allowed deviation of each column; of a constant one, round-off.
         least = 1e-12 * np.abs(values).max(axis=0) + np.finfo(float).tiny
-        return np.maximum(self.tolerance * np.ptp(values, axis=0), least)
+        allowed = np.maximum(self.tolerance * np.ptp(values, axis=0), least)
+        finest = times[-1] / MOST_POINTS
+        step = self.smoothing or max(float(np.median(np.diff(times))), finest)
+        if step < finest * (1.0 - 1e-9):
+            raise ReferenceSignalError(
+                f"smoothing must be above {finest:.3g} s for {times[-1]:.3g} s, got {step:g} s"
+            )
+        while True:
+            moments = step * np.arange(np.ceil(times[-1] / step - 1e-9) + 1.0)
+            points = np.column_stack([np.interp(moments, times, column) for column in columns])
+            begin, none = -self.order / 2 * step, [0] * self.size
+            fitted = uniform_spline(points, step, begin, self.order, none).at(times)
+            off = np.abs(fitted - values).max(axis=0)
+            if np.all(off <= allowed):
+                return points, step
+            if self.smoothing is not None or step < 2.0 * finest:
+                worst = int(np.argmax(off / allowed))
+                raise ReferenceSignalError(
+                    f"'{self.file}': smoothed over {step:.3g} s the reference is off its rows by "
+                    f"{off[worst]:.3g} in '{self.columns[worst]}', and at most "
+                    f"{allowed[worst]:.3g} is allowed, {self.tolerance:g} of the column's range. "
+                    "Choose a smaller smoothing, give more rows where the path turns, or write a "
+                    "larger tolerance"
+                )
+            step /= 2.0
 
 
 def _read(file: Path, names: Sequence[str]) -> FloatArray:
@@ -155,24 +129,18 @@ def _read(file: Path, names: Sequence[str]) -> FloatArray:
             raise ReferenceSignalError(f"'{file}': {unknown_name('column', name, header)}")
     values = np.empty((len(rows), len(names)))
     for i, row in enumerate(rows):
+        cells = dict(zip(header, row, strict=False))
         for j, name in enumerate(names):
-            place = header.index(name)
-            cell = row[place] if place < len(row) else ""
-            value = number_in(cell)
-            if value is None or abs(value) > MOST:
-                expected = "a number" if value is None else f"a number of at most {MOST:g}"
+            value = number_in(cell := cells.get(name, ""))
+            if value is None:
                 raise ReferenceSignalError(
-                    f"'{file}', row {i + 2}, {name}: expected {expected}, got '{cell[:40]}'"
+                    f"'{file}', row {i + 2}, {name}: expected a number, got '{cell[:40]}'"
                 )
             values[i, j] = value
     if len(values) < 2:
         raise ReferenceSignalError(f"'{file}' has {len(values)} rows of numbers, 2 are needed")
-    steps = np.diff(values[:, 0])
-    if not np.all(steps > 0):
-        i = int(np.argmin(steps > 0))
-        raise ReferenceSignalError(
-            f"'{file}': {names[0]} must increase, row {i + 3} has {values[i + 1, 0]:g} "
-            f"after {values[i, 0]:g}"
-        )
+    if not np.all(rises := np.diff(values[:, 0]) > 0):
+        place = int(np.argmin(rises)) + 3
+        raise ReferenceSignalError(f"'{file}': {names[0]} must increase, and not so in row {place}")
     values[:, 0] -= values[0, 0]
     return values

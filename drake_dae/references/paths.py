@@ -14,7 +14,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive, vector
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references.formulas import as_columns
-from drake_dae.references.reference import FormulaReference, check_continuity, check_order
+from drake_dae.references.reference import Reference, check_continuity, check_order
 
 
 @checked(ReferenceSignalError)
@@ -87,20 +87,6 @@ class Travel:
             steps = (steps.size - 1) * np.diff(steps)
         return values
 
-    @staticmethod
-    def shortest(length: float, limits: PathLimits, order: int) -> "Travel":
-        """Returns the shortest travel along a straight line within limits."""
-        speed, acceleration, jerk = limits.values
-        m = order - 1
-        scale = factorial(2 * m + 1) / factorial(m) ** 2  # S' = scale (x (1 - x))^m
-        first = scale / 4**m
-        second = scale * m * ((m - 1) / (4 * m - 2)) ** (m - 1) / sqrt(2 * m - 1)
-        fastest = min(
-            speed, sqrt(length * acceleration / first), (length**2 * jerk / second) ** (1 / 3)
-        )
-        ramp = max(first * fastest / acceleration, sqrt(second * fastest / jerk))
-        return Travel(length, fastest, ramp, order)
-
 
 def _bernstein(coefficients: FloatArray, x: ca.SX) -> ca.SX:
     """sum_j c_j binom(n, j) x^j (1 - x)^(n - j)."""
@@ -110,8 +96,8 @@ def _bernstein(coefficients: FloatArray, x: ca.SX) -> ca.SX:
     )
 
 
-class PathReference(FormulaReference):
-    """A motion along a path, r(t) = p(s(t - start_time)), from rest to rest."""
+class PathReference(Reference):
+    """A motion along a path, r(t) = p(s(t - start_time)), from rest to rest within limits."""
 
     limits: PathLimits | None
     start_time: float
@@ -126,17 +112,29 @@ class PathReference(FormulaReference):
     def point(self, distance: ca.SX) -> ca.SX:
         """Returns the point p(s) of the path, shape (size, 1)."""
 
+    def along(self, passed: ca.SX, degree: int) -> list[ca.SX]:
+        """Returns s, s', ..., s^(degree) at a time in s after the start."""
+        return self.travel.derivatives(passed, degree)
+
     @cached_property
     def travel(self) -> Travel:
         """The distance along the path over time after the start."""
-        if self.limits is None:
-            raise ReferenceSignalError("this reference is periodic and has no limits")
-        travel = Travel.shortest(self.length, self.limits, self.order)
+        assert self.limits is not None
+        # The shortest one along a straight line, with S' = scale (x (1 - x))^m.
+        speed, acceleration, jerk = self.limits.values
+        m = self.order - 1
+        scale = factorial(2 * m + 1) / factorial(m) ** 2
+        first = scale / 4**m
+        second = scale * m * ((m - 1) / (4 * m - 2)) ** (m - 1) / sqrt(2 * m - 1)
+        by_acceleration = sqrt(self.length * acceleration / first)
+        fastest = min(speed, by_acceleration, (self.length**2 * jerk / second) ** (1 / 3))
+        ramp = max(first * fastest / acceleration, sqrt(second * fastest / jerk))
+        travel = Travel(self.length, fastest, ramp, self.order)
+        # On a curve it is slower; sampled, with an error between the samples below 0.1 %.
         time = ca.SX.sym("t")
         _, *derivatives = self._derivatives(travel.derivatives(time, 3))
         peaks = ca.Function("peaks", [time], [ca.norm_2(derivative) for derivative in derivatives])
-        end, ramp = travel.duration, travel.ramp
-        shares = np.linspace(0.0, 1.0, 401)
+        end, shares = travel.duration, np.linspace(0.0, 1.0, 401)
         moments = np.concatenate(
             [ramp * shares, ramp + (end - 2 * ramp) * shares, end - ramp * shares]
         )
@@ -145,16 +143,13 @@ class PathReference(FormulaReference):
         slower = max(excess[0], excess[1] ** (1 / 2), excess[2] ** (1 / 3))
         if slower <= 1.0 + 1e-9:
             return travel
-        slower *= 1.001  # The error between the samples is below 0.1 %.
+        slower *= 1.001
         return replace(travel, speed=travel.speed / slower, ramp=travel.ramp * slower)
 
-    def rows(self, time: ca.SX) -> ca.SX:
-        return self.point(self.travel.derivatives(time - self.start_time, 0)[0])
-
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
-        check_continuity(self, self.order, degrees)
-        along = self.travel.derivatives(time - self.start_time, max(degrees))
-        values = self._derivatives(along)
+        if self.limits is not None:
+            check_continuity(self, self.order, degrees)
+        values = self._derivatives(self.along(time - self.start_time, max(degrees)))
         return ca.vertcat(*[values[k][i] for i, mu in enumerate(degrees) for k in range(mu + 1)])
 
     def _derivatives(self, along: Sequence[ca.SX]) -> list[ca.SX]:
@@ -259,21 +254,15 @@ class CircleReference(PathReference):
         return tau * abs(self.turns) * self.radius
 
     def point(self, distance: ca.SX) -> ca.SX:
-        return self._at(self.phase + copysign(1.0, self.turns) * distance / self.radius)
+        angle = self.phase + copysign(1.0, self.turns) * distance / self.radius
+        return ca.DM(self.center) + self.radius * ca.vertcat(ca.cos(angle), ca.sin(angle))
+
+    def along(self, passed: ca.SX, degree: int) -> list[ca.SX]:
+        if self.period is None:
+            return super().along(passed, degree)
+        speed = copysign(tau * self.radius, self.turns) / self.period
+        return [speed * passed, ca.SX(speed), *[ca.SX(0)] * degree][: degree + 1]
 
     @property
     def repeats(self) -> float | None:
         return None if self.period is None else abs(self.period)
-
-    def rows(self, time: ca.SX) -> ca.SX:
-        if self.period is None:
-            return super().rows(time)
-        return self._at(self.phase + tau / self.period * (time - self.start_time))
-
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
-        if self.period is None:
-            return super().expression(degrees, time)
-        return FormulaReference.expression(self, degrees, time)
-
-    def _at(self, angle: ca.SX) -> ca.SX:
-        return ca.DM(self.center) + self.radius * ca.vertcat(ca.cos(angle), ca.sin(angle))

@@ -44,16 +44,13 @@ class PiecewisePolynomials:
         cls, spline: Any, knots: FloatArray, times: FloatArray, unit: float, degrees: Sequence[int]
     ) -> "PiecewisePolynomials":
         """Those of r_1, ..., r_1^(mu_1), r_2, ..., r a spline of SciPy in times of a unit."""
-        widths, degree = np.diff(knots), spline.k
-        table = [spline.derivative(m)(knots[:-1]) / factorial(m) for m in range(degree + 1)]
-        rows = []
-        for column, mu in enumerate(degrees):
-            for j in range(mu + 1):
-                row = np.zeros((len(widths), degree + 1))
-                for m in range(j, degree + 1):
-                    grown = factorial(m) / factorial(m - j) / unit**j
-                    row[:, m - j] = table[m][:, column] * widths ** (m - j) * grown
-                rows.append(row)
+        widths, powers = np.diff(knots)[:, None], range(spline.k + 1)
+        terms = [spline.derivative(m)(knots[:-1]) * widths**m / factorial(m) for m in powers]
+        table = [np.stack(terms, axis=2)]
+        for _ in range(max(degrees)):
+            slopes = table[-1][:, :, 1:] * np.array(powers[1:]) / widths[:, :, None]
+            table.append(np.pad(slopes, ((0, 0), (0, 0), (0, 1))))
+        rows = [table[j][:, i] / unit**j for i, mu in enumerate(degrees) for j in range(mu + 1)]
         return cls(times, np.stack(rows, axis=1))
 
     def at(self, times: FloatArray) -> FloatArray:
@@ -106,53 +103,24 @@ class PiecewiseReference(Reference):
         return self.pieces(degrees).expression(time)
 
 
-@dataclass(frozen=True, eq=False)
-class TimeSpline:
+def uniform_spline(
+    points: FloatArray, step: float, start_time: float, order: int, degrees: Sequence[int]
+) -> PiecewisePolynomials:
     """r(t) = sum_k c_k N((t - start_time) / step - k), N the uniform B-spline of order + 1.
 
     The points c_k have shape (n, k). Before, it rests at the first one and after, at the last;
     `order` derivatives are continuous. They are averages of differences of neighbouring points,
     and so bounded: |r^(j)| <= max |Delta^j c| / step^j.
     """
-
-    points: FloatArray
-    step: float
-    start_time: float
-    order: int
-
-    @property
-    def duration(self) -> float:
-        return (len(self.points) + self.order - 1) * self.step
-
-    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
-        """Returns the polynomials of r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
-        held = np.pad(self.points, ((self.order, self.order), (0, 0)), mode="edge")
-        at = np.arange(-self.order - 1.0, len(held) + 1.0)
-        spline = scipy.interpolate.BSpline(at, held, self.order + 1)
-        knots = np.arange(len(self.points) + self.order, dtype=np.float64)
-        times = self.start_time + self.step * knots
-        return PiecewisePolynomials.of(spline, knots, times, self.step, degrees)
-
-
-class SplineReference(PiecewiseReference):
-    """A reference that is a `TimeSpline`."""
-
-    @property
-    @abstractmethod
-    def spline(self) -> TimeSpline:
-        """The spline."""
-
-    @property
-    def size(self) -> int:
-        return int(self.spline.points.shape[1])
-
-    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
-        return self.spline.pieces(degrees)
+    held = np.pad(points, ((order, order), (0, 0)), mode="edge")
+    spline = scipy.interpolate.BSpline(np.arange(-order - 1.0, len(held) + 1.0), held, order + 1)
+    knots = np.arange(len(points) + order, dtype=np.float64)
+    return PiecewisePolynomials.of(spline, knots, start_time + step * knots, step, degrees)
 
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
-class PolylineReference(SplineReference):
+class PolylineReference(PiecewiseReference):
     """A path of straight edges between points, with rounded corners, from rest to rest.
 
     It leaves an edge at the distance `corner` before its end, and joins the next one at the same
@@ -183,15 +151,17 @@ class PolylineReference(SplineReference):
         positive("corner", self.corner, ReferenceSignalError)
         check_order(self.order, 2, 12)
         length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
-        least = length * self.order / 2 / MOST_POINTS
-        if self.corner < least:
+        if self.corner < (least := length * self.order / 2 / MOST_POINTS):
             raise ReferenceSignalError(
-                f"corner must be {rounded_up(least)} or more for a path of length {length:.3g}, "
-                f"got {self.corner:g}"
+                f"corner must be above {least:.3g} for a path of length {length:.3g}, got "
+                f"{self.corner:g}"
             )
 
-    @cached_property
-    def spline(self) -> TimeSpline:
+    @property
+    def size(self) -> int:
+        return len(self.points[0])
+
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         corners, order = np.array(self.points), self.order
         spacing = 2 * self.corner / order
         edges = [corners[:1]]
@@ -204,7 +174,7 @@ class PolylineReference(SplineReference):
             (np.linalg.norm(np.diff(padded, j, axis=0), axis=1).max() / limit) ** (1 / j)
             for j, limit in enumerate(self.limits.values, start=1)
         ]
-        return TimeSpline(points, float(max(steps)), self.start_time, order)
+        return uniform_spline(points, float(max(steps)), self.start_time, order, degrees)
 
 
 @checked(ReferenceSignalError)
@@ -307,9 +277,3 @@ def _check_points(reference: PolylineReference | WaypointsReference) -> FloatArr
         i = int(np.argmin(lengths))
         raise ReferenceSignalError(f"points {i} and {i + 1} are the same, {rows[i]}")
     return points
-
-
-def rounded_up(value: float) -> str:
-    """Formats a positive number with three digits, rounded up."""
-    text = f"{value:.3g}"
-    return text if float(text) >= value else f"{1.01 * value:.3g}"

@@ -59,17 +59,13 @@ class FixedDistance(Constraint):
         return (Parameter(f"{self.name}.length", np.array([self.length]), "m", positive=True),)
 
     def residual(self, frames: Frames) -> ca.SX:
-        return length_of(self._apart(frames)) - self.parameters[0].symbol
+        return length_of(_apart(self, frames)) - self.parameters[0].symbol
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        apart = self._apart(kinematics)
+        apart = _apart(self, kinematics)
         point = kinematics.position(self.frame_b, self.point_b)
         away = apart / length_of(apart)
         return (Application(point, away, ca.SX(3, 1), self.frame_b, self.frame_a),)
-
-    def _apart(self, frames: Frames) -> ca.SX:
-        start = frames.position(self.frame_a, self.point_a)
-        return frames.position(self.frame_b, self.point_b) - start
 
 
 @checked(ModelError)
@@ -109,9 +105,7 @@ class CoincidentPoints(Constraint):
         return signals([f"{self.name}.{axis}" for axis in self.axes], "m")
 
     def residual(self, frames: Frames) -> ca.SX:
-        point_b = frames.position(self.frame_b, self.point_b)
-        apart = point_b - frames.position(self.frame_a, self.point_a)
-        return apart[self._rows]
+        return _apart(self, frames)[self._rows]
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         point = kinematics.position(self.frame_b, self.point_b)
@@ -121,6 +115,12 @@ class CoincidentPoints(Constraint):
     @property
     def _rows(self) -> list[int]:
         return ["xyz".index(axis) for axis in self.axes]
+
+
+def _apart(ends: FixedDistance | CoincidentPoints, frames: Frames) -> ca.SX:
+    """p_WB - p_WA in m, shape (3, 1)."""
+    start = frames.position(ends.frame_a, ends.point_a)
+    return frames.position(ends.frame_b, ends.point_b) - start
 
 
 @checked(ModelError)
@@ -201,7 +201,7 @@ class JointCoupler(Constraint):
     Attributes:
         follower: Name of the position that follows, as in the links' `position_signals`.
         leader: Name of the position that it follows.
-        ratio: The motion of the follower per unit of the leader; not zero.
+        ratio: The motion of the follower per unit of the leader.
         offset: The follower's position for a leader at zero, in rad or m.
         unit: The unit of the follower's position, "rad" or "m".
         name: The name of the constraint, the prefix of its force and its parameters.
@@ -213,13 +213,6 @@ class JointCoupler(Constraint):
     offset: float = 0.0
     unit: Literal["rad", "m"] = "rad"
     name: str = "coupler"
-
-    def __post_init__(self) -> None:
-        if self.follower == self.leader:
-            raise ModelError(f"'{self.follower}' cannot follow itself; name another leader")
-        if self.ratio == 0.0:
-            raise ModelError("ratio must not be zero; weld the joint if it shall not move")
-        super().__post_init__()
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

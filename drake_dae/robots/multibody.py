@@ -191,6 +191,9 @@ class MultibodyExpressions(Links):
         self.actuation_matrix = np.array(plant.MakeActuationMatrix())
         self.effort_limits = np.array([a.effort_limit() for a in actuators])
         self.gear_ratios = np.array([a.default_gear_ratio() for a in actuators])
+        for actuator, ratio in zip(actuators, self.gear_ratios, strict=True):
+            if ratio == 0.0:
+                raise ModelError(f"the gear ratio of '{actuator.name()}' must not be 0")
         self.reflected_inertia = np.array([a.default_reflected_inertia() for a in actuators])
         # As in Drake, the last of several actuators of a joint is used.
         self._rotors = np.zeros(plant.num_velocities())

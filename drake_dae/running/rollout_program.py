@@ -24,7 +24,7 @@ from drake_dae.blocks.stepping import RunProblem, StepFunctions
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.record import Record, Recorded, computed_record
+from drake_dae.diagrams.record import Record, Recorded
 from drake_dae.errors import ModelError
 from drake_dae.running.merged_run import parameters_in, put_states, states_in
 from drake_dae.systems.ideal_plants import DaePlant
@@ -302,7 +302,7 @@ class RolloutProgram:
         for name, entries in self.signals.items():
             start, stop = stop, stop + len(entries)
             signals[name] = Recorded(columns[start:stop].T, tuple(entries))
-        record = computed_record(times[first:], signals)
+        record = Record(times[first:], signals)
         return self.loop.with_errors(record) if isinstance(self.loop, ClosedLoop) else record
 
 

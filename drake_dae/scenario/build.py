@@ -173,7 +173,6 @@ def build_completed(
         plant_exogenous=plant_exogenous,
         signals={} if task is None or commanded else task.signals,
         commanded=commanded,
-        start_time=scenario.integrator.start_time,
     )
     period = settings.period(plant.time_step)
     if settings.sampling is not None:
@@ -187,15 +186,13 @@ def build_completed(
 
     # The controller and the loop: with a task the law in contact, and one with the contact open.
     if task is not None:
-        points, gains = opening_contact(scenario, model), task.gains or scenario.law.gains
+        contact, gains = opening_contact(scenario, model), task.gains or scenario.law.gains
         assert gains is not None  # advised.
-        names = [signal.name for point in points for signal in point.force_signals]
         with at("task.gains" if task.gains else "law.gains"):
-            free = dae.find_structure(open_contact(law.system, names))
+            free = dae.find_structure(open_contact(law.system, contact.force_signals[0].name))
             of_free = TrackingLaw(free.system, gains.design(), structure=free, latency=law.latency)
         with at("task"):
-            # The noise of the sum over the points.
-            made = task.make(sensors.force_noise * len(points) ** 0.5)
+            made = task.make(sensors.force_noise)
             controller = TaskController(made, law, of_free, sample_period=period or 1e-3)
             return Completed(scenario, notes), wire_loop(plant, controller, None, settings, **drawn)
     keys = ["estimator"] if scenario.estimator is not None else []

@@ -419,13 +419,12 @@ class _Search:
         scenario = self._scenario
         assert scenario.task is not None
         contact = scenario.task.contact
-        names = [contact] if isinstance(contact, str) else [*contact]
         values = {p.name: p.value for p in self._bound.parameters}
         values |= {name: np.atleast_1d(v) for name, v in scenario.plant.parameters.items()}
         moved = {
             f"{name}.position": values[f"{name}.position"] + BEFORE * normal
             for name, normal in zip(self._touches, touching.normals, strict=True)
-            if f"{name}.position" in values and (name in names or names == [""])
+            if f"{name}.position" in values and contact in (name, "")
         }
         q = self._postures(moved).solve(held, touching.rows[list(held)], touching.q)
         if q is None or not moved:

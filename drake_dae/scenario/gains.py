@@ -119,8 +119,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         if task.gains is None:
             free = {signal.name: contact.position_gains(2) for signal in model.position_signals}
             rate = contact.position_rate / _SOFTER
-            for point in opening_contact(scenario, model):
-                free[point.residual_signals[0].name] = [rate**2, 2.0 * rate]
+            distance = opening_contact(scenario, model).residual_signals[0].name
+            free[distance] = [rate**2, 2.0 * rate]
             task = replace(task, gains=_coefficients(free))
         acting = least_damping(structure, damping), contact.force_gain, period, period * (1 + late)
         task, touch_note = with_lasting_touches(task, stiffness, mobility, *acting)

@@ -1,7 +1,7 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -16,7 +16,6 @@ from drake_dae.dae.advised_gains import RAMP
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import AssumptionError, ScenarioError
-from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots import Constraint, LinkBehind, RobotModel, Surface, links_behind, own_values
 from drake_dae.running.judgement import (
@@ -233,11 +232,7 @@ def judge_run(
     if is_paced and goal is not None and not dae.exogenous.moving:
         structure = law.structure if law.system is dae else find_structure(dae)
         # The law's own degrees may be higher.
-        stacked = stack_references(goal.references, structure.layout.reference_degrees)
-
-        def reference(time: float) -> FloatArray:
-            return stacked(time).copy()
-
+        reference = stack_references(goal.references, structure.layout.reference_degrees)
         some = times[:: times.size // MOST_TIMES + 1]
         motion = ZeroDynamics(dae, structure=structure).motion(reference, some, record["state"][0])
         found = theory.limits_along(structure, limits, reference, motion)
@@ -249,7 +244,6 @@ def judge_run(
         if surface is not None:
             note = f"{constraint.name}: {surface.remark}" * bool(surface.remark)
             notes += [note, _beyond_edge(constraint, surface, model, record)]
-    notes += _remarks([scenario.references, scenario.exogenous, scenario.task])
 
     # How the run ended, and the judgement.
     ended = failure
@@ -357,14 +351,3 @@ def _beyond_edge(
         f"{constraint.name}: the robot is beyond the edge of the data by up to {most:.2g} mm, "
         f"first at {first:.3g} s; there the surface continues as a plane"
     )
-
-
-def _remarks(value: Any) -> Iterator[str]:
-    """The approximations of references in lists, mappings and dataclasses."""
-    if isinstance(value, Reference):
-        yield value.remark
-    elif isinstance(value, (list, tuple)):
-        for inner in value:
-            yield from _remarks(inner)
-    elif isinstance(value, dict) or is_dataclass(value):
-        yield from _remarks([*(value if isinstance(value, dict) else vars(value)).values()])

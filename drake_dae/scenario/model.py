@@ -253,11 +253,11 @@ def reference_and_start(
     names = [signal.name for signal in model.dae.output_signals]
     degrees = structure.layout.reference_degrees
     stacked = stack_references(references_of(scenario, names, degrees), degrees)
-    outputs = stacked(scenario.integrator.start_time).copy()[structure.layout.lowest]
+    outputs = stacked(scenario.integrator.start_time)[structure.layout.lowest]
     parameters = model.dae.parameter_values
     with at("start"):
         start = start_state(scenario, model, outputs, parameters, parameters)
-    return lambda time: stacked(time).copy(), start
+    return stacked, start
 
 
 def motion_along(

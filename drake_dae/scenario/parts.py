@@ -320,8 +320,7 @@ class Law:
         contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
             of forces change within periods of the contact: its deflection is then fed ahead. It
             needs rigid joints, and references, no task.
-        force_gain: Gbar of (59), a number or a matrix row by row, with `sensors.force`; for rigid
-            joints only.
+        force_gain: Gbar of (59), 0 or more, with `sensors.force`; for rigid joints only.
         control_weights: One weight per actuator, if there are more actuators than outputs. The law
             then chooses the control with the least sum of weight * (u - free_control)^2. The
             parameter "free_control" is zero unless it is in `exogenous`.
@@ -336,7 +335,7 @@ class Law:
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
     contact_stiffness: float | None = None
-    force_gain: ArrayLike = 0.0
+    force_gain: float = 0.0
     control_weights: list[float] = field(default_factory=list)
     largest_roughness: Positive | None = None
     largest_errors: LargestErrors | None = None
@@ -349,14 +348,11 @@ class ScenarioTask:
     It starts at rest at start.positions, or in contact near them if the first phase requires
     contact. Without start.positions it starts 20 mm before the surface, with the first reference of
     each output. While the contact is open, its distance, such as "wall.distance", is an output in
-    place of its force, and so is each distance of several points. `plant` has a contact that opens,
-    such as `!CompliantContact`.
+    place of its force. `plant` has a contact that opens, such as `!CompliantContact`.
 
     Attributes:
         phases: The phases in their order; after the last one the robot rests.
         contact: The name of the constraint that opens and closes; not needed if there is only one.
-            Or the list of points that do so together, with as many `!ForceCombination`s of their
-            forces, one of them their sum.
         contact_force: The force in N below which the contact counts as open.
         patience: The time in s after which a contact without force counts as lost.
         tare_time: The time in s at the beginning for which a task without contact measures the bias
@@ -369,7 +365,7 @@ class ScenarioTask:
     """
 
     phases: Sequence[systems.Phase]
-    contact: str | Sequence[str] = ""
+    contact: str = ""
     contact_force: float = 0.5
     patience: float = 0.25
     tare_time: float = 0.0

@@ -131,43 +131,37 @@ def _at_rest(
         return state
     # A task that begins without contact does not begin behind its surface. On a contact that gives
     # way it may be as deep as the force that counts as none presses it.
-    for contact in opening_contact(scenario, model):
-        if (touch := contact.touch(model.links)) is None:
-            continue
-        place = model.links.position(touch.frame, touch.point)
-        above = model.dae.trace("start", {"above": touch.clearance(place)}, often=False)
-        depth = -above(state, model.dae.parameters_of(loop.plant.dae, parameters))[0].item()
-        if depth > _SLACK and (
-            material is None
-            or depth * material.stiffness_on(model, task.contact_force) > task.contact_force
-        ):
-            raise ModelError(
-                f"start.positions put the point of '{contact.name}' {depth:.3g} m behind its "
-                f"surface, and {made.phases[0].name} begins in front of it; start outside, or "
-                "turn the normal of the surface around if its free side is the other one"
-            )
+    contact = opening_contact(scenario, model)
+    if (touch := contact.touch(model.links)) is None:
+        return state
+    place = model.links.position(touch.frame, touch.point)
+    above = model.dae.trace("start", {"above": touch.clearance(place)}, often=False)
+    depth = -above(state, model.dae.parameters_of(loop.plant.dae, parameters))[0].item()
+    if depth > _SLACK and (
+        material is None
+        or depth * material.stiffness_on(model, task.contact_force) > task.contact_force
+    ):
+        raise ModelError(
+            f"start.positions put the point of '{contact.name}' {depth:.3g} m behind its "
+            f"surface, and {made.phases[0].name} begins in front of it; start outside, or "
+            "turn the normal of the surface around if its free side is the other one"
+        )
     return state
 
 
-def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, ...]:
-    """The constraints of the points of the contact of a task."""
+def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:
+    """The constraint of the contact of a task."""
     assert scenario.task is not None
     fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
-    given, there = scenario.task.contact, ", ".join(fitting) or "none"
-    names = [given] if isinstance(given, str) and given else list(given)
+    name, there = scenario.task.contact, ", ".join(fitting) or "none"
     with at("task.contact"):
-        for name in names:
-            if name not in fitting:
-                text = f"'{name}' is not a unilateral constraint with one force; these are {there}"
-                raise ModelError(text)
-        if len(set(names)) < len(names):
-            raise ModelError(f"a point is named twice: {', '.join(names)}")
-        if not names and len(fitting) != 1:
-            raise ModelError(
-                f"needed, since the unilateral constraints with one force are {there}; give one, "
-                "or a list of points"
-            )
-    return tuple(c for name, c in fitting.items() if not names or name in names)
+        if name and name not in fitting:
+            text = f"'{name}' is not a unilateral constraint with one force; these are {there}"
+            raise ModelError(text)
+        if not name and len(fitting) != 1:
+            text = f"needed, since the unilateral constraints with one force are {there}; give one"
+            raise ModelError(text)
+    return fitting[name] if name else next(iter(fitting.values()))
 
 
 def start_state(

@@ -108,7 +108,6 @@ def add_live_view(
     if links is not None:
         builder.AddSystem(links)
         builder.Connect(plant.GetOutputPort("link_state"), links.get_input_port())
-    plant.add_own_view(builder, meshcat)
 
 
 def draw_scene(

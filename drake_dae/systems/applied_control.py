@@ -2,19 +2,17 @@
 
 from dataclasses import dataclass
 from math import ceil, floor
-from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import EventStatus
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number, positive
 from drake_dae.blocks.block import Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.errors import ModelError, NonFiniteError, WiringError
+from drake_dae.errors import ModelError
 
 _SAME = 1e-9  # Times that differ by less than this, in periods, count as equal.
 
@@ -89,16 +87,6 @@ class ControlHold(TracedSystem):
             held["later"] = Held(later, coming, np.tile(unknown, count), rate, begin=begin)
         inputs, outputs = {"control": control}, {"control": now}
         super().__init__(Block("control_hold", inputs, outputs, held=held))
-
-    def _begin(self, *arguments: Any) -> EventStatus:
-        try:
-            return super()._begin(*arguments)
-        except NonFiniteError as error:
-            raise WiringError(
-                "the first control cannot be found, as where a law reads the force that its own "
-                "control makes: put a ForceSensor with a sample_period between, or set what "
-                "control_hold holds before the first sample by SetDiscreteState"
-            ) from error
 
 
 @checked(ModelError)

@@ -15,10 +15,10 @@ from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.references import ConstantReference
 from drake_dae.references.by_name import assign, in_order
+from drake_dae.references.reference import stacked_expression
 from drake_dae.systems.controller import SIGNAL, law_block
 from drake_dae.systems.phases import Moment
-from drake_dae.systems.references import traced_references
-from drake_dae.systems.task import CONTACT, FREE, OpeningContact, Task
+from drake_dae.systems.task import CONTACT, FREE, Task
 
 CHANGE = (
     *(Signal("number of changes"), Signal("phase"), Signal("in contact"), Signal("start", "s")),
@@ -67,18 +67,13 @@ def faded(offset: ca.SX, degrees: Sequence[int], passed: ca.SX, over: ca.SX) -> 
 
     and 0 afterwards; shape as d.
     """
-    left, first = [], 0
+    left, first = list[ca.SX](), 0
     for mu in degrees:
-        factors = fading(max(mu, SMOOTH))[: mu + 1]
-        powers = [ca.SX(1)]
-        for _ in range(factors.shape[1] - 1):
-            powers.append(powers[-1] * (passed / over))
-        own = offset[first : first + mu + 1]
-        for j in range(mu + 1):
-            row = ca.vertcat(*powers[: factors.shape[1]])
-            left.append(
-                sum(own[k] * over ** (k - j) * ca.dot(factors[k], row) for k in range(mu + 1))
-            )
+        factors, own = fading(max(mu, SMOOTH)), offset[first : first + mu + 1]
+        for j in range(mu + 1):  # over^j p^(j)
+            powers = ca.vertcat(*((passed / over) ** i for i in range(factors.shape[1])))
+            terms = (own[k] * over**k * ca.dot(factors[k], powers) for k in range(mu + 1))
+            left.append(sum(terms, ca.SX(0)) / over**j)
             factors = factors[:, 1:] * np.arange(1, factors.shape[1])
         first += mu + 1
     return ca.if_else(passed < over, ca.vertcat(*left), 0)
@@ -106,11 +101,12 @@ class Automaton:
     def __init__(
         self,
         task: Task,
-        contact: OpeningContact,
+        contact: tuple[int, int],
         laws: tuple[TrackingLaw, TrackingLaw],
         period: float,
     ) -> None:
-        self.task, self.contact, self.laws, self.period = task, contact, laws, period
+        (self.main, self.row), self.laws = contact, laws  # The output and the constraint force.
+        self.task, self.period = task, period
         self.phases, self.end = task.all_phases, len(task.all_phases)
         closed, free = laws[CONTACT].system, laws[FREE].system
         self.state, self.values = closed.state, closed.parameter_symbol
@@ -123,16 +119,14 @@ class Automaton:
             own = [law.system.state, law.system.parameter_symbol]
             chain = ca.Function("chain", own, [law.structure.chain])
             self.chains += chain.call([self.state, self.values])
-        starts, chain, places = laws[FREE].layout.starts, self.chains[FREE], list(contact.places)
-        self.distance, self.rate = (
-            ca.sum1(chain[(starts[places] + order).tolist()]) / contact.size for order in (0, 1)
-        )
-        in_metres = [i for i, each in enumerate(free.output_signals) if each.unit == "m"]
-        rest = starts[[i for i in in_metres if i not in places]].tolist()
+        starts, chain = laws[FREE].layout.starts.tolist(), self.chains[FREE]
+        self.distance, self.rate = (chain[starts[self.main] + order] for order in (0, 1))
+        units = [signal.unit for signal in free.output_signals]
+        rest = [starts[i] for i, unit in enumerate(units) if unit == "m" and i != self.main]
         self.moved = ca.vertcat(self.distance, chain[rest])
         self.first_force = task.contact_force * task.contacts[0]
         # The held values, and their present ones: before the task begins those of its begin.
-        columns = {"change": len(CHANGE), "entered": self.end, "filter": 2 * contact.size + 1}
+        columns = {"change": len(CHANGE), "entered": self.end, "filter": 3}
         columns |= {"touched": 1, "felt": 2, "moved": self.moved.numel()}
         columns |= {"begun": max(law.layout.reference_size for law in laws)}
         self.held = {name: ca.SX.sym(name, size) for name, size in columns.items()}
@@ -146,49 +140,39 @@ class Automaton:
         self.references = [self._reference(which) for which in (FREE, CONTACT)]
 
     def _filter(self) -> None:
-        """The low-pass of the contact's forces minus their bias, the mean of the first samples."""
-        size, own = self.contact.size, self.force[list(self.contact.forces)]
-        low, bias, count = ca.vertsplit(self.held["filter"], [0, size, 2 * size, 2 * size + 1])
-        tares, unbiased = self.task.tare_samples(self.period), own
+        """The low-pass of the contact's force minus its bias, the mean of the first samples."""
+        low, bias, count = ca.vertsplit(self.held["filter"])
+        tares, unbiased = self.task.tare_samples(self.period), self.force[self.row]
         self.waits = count < tares - 0.5
         if tares:
             count = ca.if_else(self.waits, count + 1, count)
-            bias = ca.if_else(self.waits, bias + (own - bias) / count, bias)
-            unbiased = ca.if_else(self.waits, ca.SX.zeros(size), own - bias)
-        self.each = low + self.task.force_gain * (unbiased - low)
-        self.filtered, self.total = ca.vertcat(self.each, bias, count), ca.sum1(self.each)
+            bias = ca.if_else(self.waits, bias + (unbiased - bias) / count, bias)
+            unbiased = ca.if_else(self.waits, 0, unbiased - bias)
+        self.total = low + self.task.force_gain * (unbiased - low)
+        self.filtered = ca.vertcat(self.total, bias, count)
         self.tared = ca.SX(self.force)
-        self.tared[list(self.contact.forces)] -= bias
+        self.tared[self.row] -= bias
 
     # The references.
 
     def _goals_of(self, place: int) -> tuple[FloatArray, ca.SX, ca.SX, FloatArray]:
         """Ones for outputs without goals in a phase, R at its start and now, and their rates."""
-        phase, contact, is_closed = self.phases[place], self.contact, self.task.contacts[place]
-        law = self.laws[int(is_closed)]
+        phase, law = self.phases[place], self.laws[int(self.task.contacts[place])]
         names, where = [s.name for s in law.system.output_signals], self.task.where(place)
-        main, rates, time = names[contact.main], np.zeros(len(names)), ca.SX.sym("time")
+        main, rates, time = names[self.main], np.zeros(len(names)), ca.SX.sym("time")
         for name, rate in phase.rates(main).items():
             if name not in names:
                 raise ModelError(f"{where}: {unknown_name('output', name, names)}")
             rates[names.index(name)] = rate
-        if not is_closed:
-            rates[contact.others] = rates[contact.main]
-        at_rest = ConstantReference(0.0)
         try:
             found = [
                 assign(name, goal, names, law.degrees) for name, goal in phase.goals(main).items()
             ]
             named = [i for each in found for i in each.places]
-            for each in [each for each in found if list(each.places) == [contact.main]]:
-                goal = at_rest if is_closed else each.reference
-                others = [i for i in contact.others if i not in named]
-                found += [assign(names[i], goal, names, law.degrees) for i in others]
-                named += others
             is_free = np.isin(np.arange(len(names)), named, invert=True)
-            unnamed = np.flatnonzero(is_free)
+            at_rest, unnamed = ConstantReference(0.0), np.flatnonzero(is_free)
             found += [assign(names[i], at_rest, names, law.degrees) for i in unnamed]
-            row = traced_references(in_order(found, names), law.degrees, time)
+            row = stacked_expression(in_order(found, names), law.degrees, time)
         except ReferenceSignalError as error:
             raise ModelError(f"{where}: {error}") from error
         start, now = (ca.substitute(row, time, at) for at in (ca.SX(0), self.passed))
@@ -230,9 +214,9 @@ class Automaton:
     def _present(self, which: int, force: ca.SX | float) -> ca.SX:
         """R of a law from the present outputs, z_i, z_i', ...; zero for the highest derivatives.
 
-        A force of degree 0 is the measured one; differences of such forces begin at zero.
+        A force of degree 0 is the measured one.
         """
-        law, main = self.laws[which], self.contact.main
+        law, main = self.laws[which], self.main
         reference = ca.SX.zeros(law.layout.reference_size)
         reference[law.layout.chained.tolist()] = self.chains[which]
         if which == CONTACT and law.degrees[main] == 0:
@@ -244,7 +228,7 @@ class Automaton:
         own, other, law = self.references[which], self.references[1 - which], self.laws[which]
         met, starts = self._present(which, force), self.laws[1 - which].layout.lowest.tolist()
         for i, (first, mu) in enumerate(zip(law.layout.lowest.tolist(), law.degrees, strict=True)):
-            if i not in self.contact.places:
+            if i != self.main:
                 met[first : first + mu + 1] = other[starts[i] : starts[i] + mu + 1]
         begun = ca.SX.zeros(self.held["begun"].numel())
         begun[: met.numel()] = ca.if_else(self.is_closed == (which == CONTACT), own, met)
@@ -254,11 +238,9 @@ class Automaton:
 
     def _causes(self, control: ca.SX) -> ca.SX:
         """Why the present phase ends; BEGUN while it goes on. The force is after its low-pass."""
-        task, contact, controls, wanted = self.task, self.contact, {}, ca.SX(0)
-        for which, law in enumerate(self.laws):
-            places = [contact.main] if which == CONTACT else list(contact.places)
-            rows = law.layout.lowest[places].tolist()
-            wanted += ca.sum1(self.references[which][rows]) / len(places)
+        task, controls = self.task, dict[str, ca.SX]()
+        pairs = zip(self.references, self.laws, strict=True)
+        wanted = sum((R[int(law.layout.lowest[self.main])] for R, law in pairs), ca.SX(0))
         names = [signal.name for signal in self.laws[FREE].system.control_signals]
         for name in task.watched("control"):
             if name and name not in names:
@@ -345,12 +327,10 @@ class Automaton:
         if which == CONTACT:
             # No integral moves while no force is measured, and during the transition after a
             # touch: the force of an impact is no error.
-            least = self.contact.size * ca.mmin(self.each)
             settles = ca.logic_and(self.held["touched"], self.passed < self.over)
-            waits = ca.logic_or(waits, ca.logic_or(least < self.task.contact_force, settles))
+            waits = ca.logic_or(waits, ca.logic_or(self.total < self.task.contact_force, settles))
         else:
-            rest = [i for i in range(self.force.numel()) if i not in self.contact.forces]
-            measured = measured[rest]
+            measured = measured[[i for i in range(self.force.numel()) if i != self.row]]
         block = law_block(law, self.period)
         gains = ca.SX.sym("gains", block.parameters.numel() - self.values.numel())
         given = {
@@ -370,18 +350,16 @@ class Automaton:
 
     def block(self) -> Block:
         """The block; see `TaskController`."""
-        contact, closed = self.contact, self.laws[CONTACT].system
+        closed = self.laws[CONTACT].system
         (free_law, free_gains), (law, gains) = self._law(FREE), self._law(CONTACT)
         control = ca.if_else(self.is_closed, law.outputs["control"], free_law.outputs["control"])
-        # The outputs of the law in contact, then all distances.
+        # The outputs of the law in contact, then the distance.
         count = closed.num_outputs
-        desired = ca.SX.zeros(count + contact.size)
-        columns = np.arange(count)
+        desired, columns = ca.SX.zeros(count + 1), list(range(count))
         for which in (CONTACT, FREE):
-            if which == FREE:
-                columns[list(contact.places)] = range(count, count + contact.size)
             rows = self.laws[which].layout.lowest.tolist()
-            desired[columns.tolist()] += self.references[which][rows]
+            desired[columns] += self.references[which][rows]
+            columns[self.main] = count
         integrals = {
             name: its.held["integral"]
             for name, its in (("integral", law), ("free_integral", free_law))

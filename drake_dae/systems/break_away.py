@@ -75,23 +75,17 @@ LITTLE = 1e-9  # the least normal force, in N, by which is divided
 
 @dataclass(frozen=True, eq=False)
 class ContactTerms:
-    """The directions of friction and constraints at a state.
+    """The directions of friction and constraints at a state, as in `Observation`."""
 
-    C is the friction force per unit of each coefficient, shape (k, c); W, Q and T are those of
-    `Observation`. `held` are the planes of contacts that stick, side by side, zero for others;
-    `slides` and `sticks` are 1 for each contact that certainly slides, or may stick, shape (c,);
-    `valid` is finite if all of these are valid.
-    """
-
-    friction: ca.SX
-    metric: Metric
-    free: ca.SX
-    planes: Sequence[ca.SX]
-    held: ca.SX
+    friction: ca.SX  # C, the friction force per unit of each coefficient, shape (k, c)
+    metric: Metric  # W
+    free: ca.SX  # Q
+    planes: Sequence[ca.SX]  # T of each contact
+    held: ca.SX  # those of contacts that stick, side by side, zero for others
     velocity: ca.SX
-    slides: ca.SX
-    sticks: ca.SX
-    valid: ca.SX
+    slides: ca.SX  # 1 for each contact that certainly slides, shape (c,)
+    sticks: ca.SX  # 1 for each that may stick
+    valid: ca.SX  # finite if all of these are valid
 
 
 class Contacts:

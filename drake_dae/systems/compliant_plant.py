@@ -30,7 +30,7 @@ from drake_dae.systems.contact_laws import (
 from drake_dae.systems.ideal_plants import joint_outputs
 from drake_dae.systems.plant import ParameterizedSystem, Plant, changed_parameters, port_signals
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
-from drake_dae.trace.functions import FailureKind, TracedFunction
+from drake_dae.trace.functions import FailureKind
 
 FITS = 1e-3  # the allowed depth of a ball at its contact point, relative to its radius
 
@@ -100,37 +100,29 @@ class CompliantPlant(ParameterizedSystem, Plant):
         self.structure = structure_of(dae, structure, find_constraint_structure)
         self.time_step, self.material = material.time_step, material
         self._checked_step = np.zeros(0)
-        numbers, normals = ca.SX.sym("material", 4), ca.SX.sym("normals", 3 * count)
+        numbers = ca.SX.sym("material", material.values.size)
+        normals = ca.SX.sym("normals", 3 * count)
         contacts = point_contacts(model, normals, numbers, material)
-        own = ca.vertcat(dae.parameter_symbol, numbers, normals)
-        depths = {"depths": ca.vertcat(*(contact.depth for contact in contacts))}
-        inputs = {"state": dae.state, "parameters": own}
-        self._normals = dae.trace("normals", {"normals": ball_normals(model)}, often=False)
-        self._depths = TracedFunction("depths", inputs, depths, often=False)
+        # The balls in the nominal configuration, and how deep they are where they shall touch.
+        placed, depths = ball_normals(model), ca.vertcat(*(contact.depth for contact in contacts))
+        balls = {"normals": placed, "depths": ca.substitute(depths, normals, placed)}
+        self._balls = dae.trace("balls", balls, {"material": numbers}, often=False)
         start = {
             "state": self.structure.manifold.project(dae.nominal_state, values),
             "parameters": self._placed(values, material),
         }
         block = compliant_block(model, self.structure, material, contacts, start)
+        own = ca.vertcat(dae.parameter_symbol, numbers, normals)
         super().__init__(dae, replace(block, parameters=own))
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         return {"contact_force": self.block.signals["contact_force"]}
 
-    @property
-    def further_parameters(self) -> Mapping[str, tuple[Signal, int]]:
-        first = self.dae.parameter_symbol.numel()
-        return {
-            signal.name: (signal, first + place)
-            for place, signal in enumerate(self.material.signals)
-            if signal is not FRICTION or self.material.friction is not None
-        }
-
     def friction(self, context: Context) -> dict[str, float]:
-        if FRICTION.name not in self.further_parameters:
+        if self.material.friction is None:
             return super().friction(context)
-        place = self.further_parameters[FRICTION.name][1]
+        place = self.dae.parameter_symbol.numel() + self.material.signals.index(FRICTION)
         value = float(context.get_numeric_parameter(0).GetAtIndex(place))
         return {constraint.name: value for constraint in self.robot("friction").constraints}
 
@@ -177,9 +169,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
             check_step(model, self.time_step, values)
             self._checked_step = values.copy()
         state = self.structure.manifold.project(model.dae.nominal_state, values)
-        normals = self._normals(state, values)[0]
-        parameters = np.concatenate([values, material.values, normals])
-        depths = self._depths(state, parameters)[0]
+        normals, depths = (v.copy() for v in self._balls(state, material.values, values))
         for constraint, depth in zip(model.constraints, depths.tolist(), strict=True):
             if not depth <= FITS * material.radius:
                 raise ModelError(
@@ -187,7 +177,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
                     f"'{constraint.name}' where it shall touch, since the surface bends toward it "
                     "more than the ball does: take a smaller radius"
                 )
-        return parameters
+        return np.concatenate([values, material.values, normals])
 
 
 def compliant_block(
@@ -305,17 +295,17 @@ def stages_after(model: RobotModel, time_step: float, control: ca.SX) -> ca.SX:
     oscillation of frequency w keeps its amplitude for w h < 2, with the frequency w_h of sin(w_h h
     / 2) = w h / 2 in place of w.
     """
-    dae, size = model.dae, _num_link_states(model)
-    rates = stage_rates(model, control)
-    after = ca.vertcat(dae.state[:size], dae.state[size:] + time_step * rates)
+    state, rates = model.dae.state, stage_rates(model, control)
+    size = state.numel() - rates.numel()
+    after = ca.vertcat(state[:size], state[size:] + time_step * rates)
     for position, velocity in _shafts(model).items():
-        after[position] = dae.state[position] + time_step * after[velocity]
+        after[position] = state[position] + time_step * after[velocity]
     return after[size:]
 
 
 def stage_rates(model: RobotModel, control: ca.SX) -> ca.SX:
     """s' = E^-1 (drift(q, v, s) + drive u) as an expression of x and u, shape (k, 1)."""
-    dae, size = model.dae, _num_link_states(model)
+    dae, size = model.dae, model.links.q.numel() + model.links.v.numel()
     driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
     # Stages do not share a mass with the links.
     return PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
@@ -325,16 +315,15 @@ def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> N
     """Refuses a step that is too long for the stages of a robot.
 
     About rest at the nominal state, one step multiplies small deviations of (q, v, s) by a matrix,
-    whose eigenvalues must not be outside the unit circle. For springs without damping this means w
-    h <= 2; for the electric part of a motor R h / L <= 2, and less if it oscillates with the
-    inertia.
+    whose eigenvalues must not be outside the unit circle: w h <= 2 for springs without damping,
+    R h / L <= 2 for the electric part of a motor, and less if it oscillates with the inertia.
     """
     dae, links = model.dae, model.links
     assert model.joint_force is not None
     # C of x' = C x for links and stages without weight.
     B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
     velocity = ca.mtimes(links.velocity_map, links.v)
-    stages = dae.f[_num_link_states(model) :]
+    stages = dae.f[velocity.numel() + B.shape[0] :]
     forces = ca.vertcat(velocity, ca.mtimes(B, model.joint_force), stages)
     outputs = {"mass": dae.mass_matrix, "slope": ca.jacobian(forces, dae.state)}
     mass, force = dae.trace("linear motion", outputs, often=False)(dae.nominal_state, parameters)
@@ -343,27 +332,21 @@ def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> N
     moved, one = np.zeros_like(slope), np.eye(len(slope))
     moved[positions] = slope[positions]
 
-    def growth(step: float) -> float:
+    def is_stable(step: float) -> bool:
         matrix = np.linalg.solve(one - step * moved, one + step * (slope - moved))
-        return float(np.abs(np.linalg.eigvals(matrix)).max()) - 1.0
+        return bool(np.abs(np.linalg.eigvals(matrix)).max() <= 1.0 + 1e-7)  # Round-off.
 
-    round_off = 1e-7  # of motions without a force
-    if growth(time_step) <= round_off:
+    if is_stable(time_step):
         return
-    fastest = float(np.abs(np.linalg.eigvals(slope)).max())
-    shorter = [float(f"{part * time_step:.1e}") for part in np.geomspace(1.0, 0.01, 300)[1:]]
-    fitting = next((step for step in shorter if growth(step) <= round_off), None)
-    remedy = f", and so is one of {shorter[-1]:g} s; damp it, or take an ideal plant"
-    if fitting is not None:
-        remedy = f". Take {fitting:g} s or less; the law may keep its period with `sampling`"
+    shorter = [float(f"{part * time_step:.1e}") for part in np.geomspace(1.0, 0.01, 300)]
+    fitting = next(filter(is_stable, shorter), 0.0)
+    remedy = f"take {fitting:g} s or less; the law may keep its period with `sampling`"
+    if not fitting:
+        remedy = f"{shorter[-1]:g} s, too; damp it, or take an ideal plant"
     raise ModelError(
         f"a time_step of {time_step:g} s is too long for what drives the joints, which has motions "
-        f"of {fastest:.3g} rad/s: each step would let one grow by {growth(time_step):.2g}{remedy}"
+        f"of {np.abs(np.linalg.eigvals(slope)).max():.3g} rad/s: {remedy}"
     )
-
-
-def _num_link_states(model: RobotModel) -> int:
-    return int(model.links.q.numel() + model.links.v.numel())
 
 
 def _shafts(model: RobotModel) -> dict[int, int]:

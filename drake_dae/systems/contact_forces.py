@@ -155,24 +155,15 @@ class DisturbanceForce:
             )
 
     @property
-    def reference(self) -> ExpressionReference:
-        """F(t) as three rows."""
-        return ExpressionReference(
-            lambda time: [component * self._share(time) for component in self.force]
-        )
-
-    @property
     def course(self) -> ExpressionReference:
         """The factor of F."""
-        return ExpressionReference(lambda time: [self._share(time)])
 
-    def _share(self, time: ca.SX) -> ca.SX:
-        def risen(start: float) -> ca.SX:
+        def risen(time: ca.SX, start: float) -> ca.SX:
             x = ca.fmin(ca.fmax((time - start) / self.rise, 0.0), 1.0)
             return x * x * (3.0 - 2.0 * x)
 
-        share = risen(self.start_time)
-        return share if self.end_time is None else share - risen(self.end_time)
+        end = np.inf if self.end_time is None else self.end_time
+        return ExpressionReference(lambda t: [risen(t, self.start_time) - risen(t, end)])
 
 
 class AppliedDisturbances(LeafSystem):
@@ -184,7 +175,7 @@ class AppliedDisturbances(LeafSystem):
         super().__init__()
         self.set_name("disturbances")
         self._arguments = disturbances, frames
-        self._forces = [each.reference.derivatives([0, 0, 0]) for each in disturbances]
+        self._courses = [each.course.derivatives([0]) for each in disturbances]
         self._applied = []
         for disturbance, frame in zip(disturbances, frames, strict=True):
             applied = ExternallyAppliedSpatialForce()
@@ -204,6 +195,8 @@ class AppliedDisturbances(LeafSystem):
 
     def _calc(self, context: Context, output: Value) -> None:
         time = context.get_time()
-        for applied, force in zip(self._applied, self._forces, strict=True):
-            applied.F_Bq_W = SpatialForce([0.0, 0.0, 0.0], force(time))
+        every = zip(self._arguments[0], self._applied, self._courses, strict=True)
+        for disturbance, applied, course in every:
+            force = course(time) * np.array(disturbance.force)
+            applied.F_Bq_W = SpatialForce([0.0, 0.0, 0.0], force)
         output.set_value(self._applied)

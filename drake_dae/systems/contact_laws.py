@@ -65,15 +65,15 @@ class PointMaterial:
     @property
     def signals(self) -> tuple[Signal, ...]:
         """Names and units of `values`, named by the keys of a scenario's `plant`."""
-        named = {"stiffness": "N/m", "dissipation": "s/m"}
-        first = (Signal(f"plant.{name}", unit) for name, unit in named.items())
-        return (*first, FRICTION, Signal("plant.radius", "m"))
+        spring = Signal("plant.stiffness", "N/m"), Signal("plant.dissipation", "s/m")
+        friction = () if self.friction is None else (FRICTION,)
+        return (*spring, *friction, Signal("plant.radius", "m"))
 
     @property
     def values(self) -> FloatArray:
-        """The numbers that are parameters of a `CompliantPlant`: k, d, mu and the radius."""
-        friction = 0.0 if self.friction is None else self.friction
-        return np.array([self.stiffness, self.dissipation, friction, self.radius])
+        """The numbers that are parameters of a `CompliantPlant`: k, d, mu if any, the radius."""
+        friction = [] if self.friction is None else [self.friction]
+        return np.array([self.stiffness, self.dissipation, *friction, self.radius])
 
 
 @checked(ModelError)
@@ -205,7 +205,7 @@ def point_contacts(
     `normals` are the `ball_normals` of the nominal configuration, `numbers` the material's values.
     """
     kinematics, links = model.links.kinematics(), model.links
-    stiffness, dissipation, friction, radius = ca.vertsplit(numbers)
+    stiffness, dissipation, *friction, radius = ca.vertsplit(numbers)
     contacts = []
     for i, (constraint, touch) in enumerate(touching(model)):
         point = ca.SX.sym("point", 3)
@@ -217,7 +217,7 @@ def point_contacts(
         coefficients = {"friction": ca.SX(0), "viscous_friction": ca.SX(0)}
         for parameter in constraint.parameters:
             coefficients[parameter.name.removeprefix(f"{constraint.name}.")] = parameter.symbol
-        own = coefficients["friction"] if material.friction is None else friction
+        (own,) = friction or [coefficients["friction"]]
         arm = ca.mtimes(links.rotation(touch.frame), radius * normals[3 * i : 3 * i + 3])
         ball = links.position(touch.frame, touch.point) + arm
         normal, depth = _overlap(touch, ball, radius)
@@ -279,15 +279,10 @@ def contact_step(
     "Irrotational contact fields"). Drake's solver stops at a relative residual of 1e-6; this one
     solves for v_c to round-off by a primal-dual Newton's method: since p = v_t / |v_t|_s are
     separate unknowns, it also converges if the sliding direction turns (Chan, Golub and Mulet
-    1999). Velocities and impulses of a contact have the normal as their first axis. For n
-    velocities of joints it solves n equations if these are fewer than the 3 k of the contacts: with
-    the slope G of the impulses and W = J A^-1 J^T
-
-        (1 - W G)^-1 = 1 + J (A - J^T G J)^-1 J^T G.
-
-    Only the last step is differentiated, with the velocity before it and the matrix as
-    constants: by the implicit function theorem, first derivatives are then those of the solution,
-    at a third of the operations.
+    1999), with the slope G of the impulses and W = J A^-1 J^T. Velocities and impulses of a contact
+    have the normal as their first axis. Only the last step is differentiated, with the velocity
+    before it and the matrix as constants: by the implicit function theorem, first derivatives are
+    then those of the solution, at a third of the operations.
 
     Returns v_+ from v before and v* = `free` after a step without contact; the mean forces of the
     contacts on the robot in N; and a number that is negative where they were not found.
@@ -299,8 +294,7 @@ def contact_step(
     before = ca.mtimes(jacobian, v) - surface
     target = ca.mtimes(jacobian, free) - surface
     response = PositiveDefiniteFactorization(mass).solve(jacobian.T)
-    is_reduced = 3 * count > v.numel()
-    delassus = None if is_reduced else ca.mtimes(jacobian, response)
+    delassus = ca.mtimes(jacobian, response)  # W
     laws = [
         _Lagged(contact, of_one, rows, mass, h)
         for contact, of_one, rows in zip(contacts, _each(before), _each(jacobian), strict=True)
@@ -312,29 +306,18 @@ def contact_step(
         )
 
     def residual(velocity: ca.SX) -> ca.SX:
-        gamma = impulses(velocity)
-        if is_reduced:
-            return velocity - target - ca.mtimes(jacobian, ca.mtimes(response, gamma))
-        return velocity - target - ca.mtimes(delassus, gamma)
+        return velocity - target - ca.mtimes(delassus, impulses(velocity))
 
     velocity = before
     shares = [law.share(own) for law, own in zip(laws, _each(before), strict=True)]
     for remaining in reversed(range(ITERATIONS)):
         now = list(zip(laws, _each(velocity), shares, strict=True))
         slope = ca.diagcat(*(law.slope(own, share) for law, own, share in now))
-        if is_reduced:
-            matrix = mass - ca.mtimes([jacobian.T, slope, jacobian])
-        else:
-            matrix = ca.SX.eye(3 * count) - ca.mtimes(delassus, slope)
+        matrix = ca.SX.eye(3 * count) - ca.mtimes(delassus, slope)
         if not remaining:
-            velocity, matrix, slope = map(as_constant, (velocity, matrix, slope))
+            velocity, matrix = map(as_constant, (velocity, matrix))
             now = list(zip(laws, _each(velocity), shares, strict=True))
-        change = -residual(velocity)
-        if is_reduced:
-            pushed = ca.mtimes([jacobian.T, slope, change])
-            change += ca.mtimes(jacobian, Factorization(matrix).solve(pushed))
-        else:
-            change = _solved(matrix, change)
+        change = _solved(matrix, -residual(velocity))
         shares = [
             law.next_share(own, share, moved)
             for (law, own, share), moved in zip(now, _each(change), strict=True)

@@ -15,7 +15,6 @@ from pydrake.geometry import (
     GeometryId,
     GeometrySet,
     HalfSpace,
-    Meshcat,
     ProximityProperties,
     Role,
     SceneGraph,
@@ -24,7 +23,6 @@ from pydrake.geometry import (
     TriangleSurfaceMesh,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
@@ -91,7 +89,6 @@ class ContactPlant(Diagram, Plant):
         constraint_residual: phi and phi', as for `DaePlant`; not zero in compliant contact.
         controlled_output: z = l(x) + m(x) lambda.
         contact_results: Drake's.
-        query_object: Drake's, of the scene with the contact geometry.
 
     Args:
         model: The robot, with rigid joints: each constraint a `PointOnSurface` at rest, on a
@@ -167,7 +164,6 @@ class ContactPlant(Diagram, Plant):
         builder.ExportInput(plant.get_actuation_input_port(), "control")
         shown = {name: signals.GetOutputPort(name) for name in block.outputs}
         shown |= {"state": state, "link_state": state, "contact_results": results}
-        shown["query_object"] = scene_graph.get_query_output_port()
         for name, port in shown.items():
             builder.ExportOutput(port, name)
         builder.BuildInto(self)
@@ -229,11 +225,6 @@ class ContactPlant(Diagram, Plant):
         if self._friction is None:
             return super().friction(context)
         return {constraint.name: self._friction for constraint in self.model.constraints}
-
-    def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
-        contact = builder.AddSystem(ContactVisualizer(meshcat))
-        for name in ("contact_results", "query_object"):
-            builder.Connect(self.GetOutputPort(name), contact.GetInputPort(name))
 
     def state(self, context: Context) -> FloatArray:
         multibody_context = self.GetSubsystemContext(self.multibody, context)

@@ -62,16 +62,7 @@ class ParameterFilter:
     theta* is within its bounds, and c_1, c_2 >= 0. After a sample the estimate is projected on the
     numbers within the bounds of each parameter, and of each contact's compliances, in the metric of
     P^-1, which raises no (theta - theta*)^T P^-1 (theta - theta*). To clip a number alone leaves
-    what is correlated with it where it is.
-
-    Args:
-        identified: The parameters.
-        within: Their lowest and highest values.
-        frictions: The number of coefficients of friction, which follow these in theta.
-        largest_friction: Their upper bound.
-        rate: k_o in 1/s.
-        period: The time between samples of the filter in s.
-        memory: `MEMORY` or `NOISY_MEMORY`, in s.
+    what is correlated with it where it is. Coefficients of friction are the last in theta.
     """
 
     def __init__(
@@ -121,17 +112,10 @@ class ParameterFilter:
         is_closed: ca.SX,
         is_used: ca.SX,
     ) -> ca.SX:
-        """What is held after a sample.
+        """What is held after a sample; nothing is estimated while `is_used` is 0.
 
-        Args:
-            theta: The parameters before it, with the coefficients of friction.
-            r: The disturbance that is left, shape (k, 1).
-            regressor: Y, low-pass filtered as r is, shape (k, c).
-            inertia: The diagonal of M, shape (k, 1).
-            gaps: The distances in contact, shape (j, 1), their derivatives, (j, c'), and their
-                second derivatives, (j c', c').
-            forces, is_closed: The constraint force at each of these, and whether it presses.
-            is_used: 0 while nothing is estimated.
+        `inertia` is the diagonal of M. `gaps` are the distances in contact, (j, 1), with first and
+        second derivatives, (j, c') and (j c', c'); there `forces` act, and press where closed.
         """
         num, P, scale = self._num, self._forgotten(), 1.0 / ca.sqrt(inertia)
         rest, rows = scale * r, scale * regressor

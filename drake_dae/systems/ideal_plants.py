@@ -61,7 +61,6 @@ class DaePlant(ParameterizedSystem, Plant):
     Args:
         system: The system (1)-(3).
         structure: Its structure; found if None.
-        project: False leaves the drift off N* uncorrected, to study it.
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
@@ -73,15 +72,9 @@ class DaePlant(ParameterizedSystem, Plant):
 
     __slots__ = SHARED_DICTIONARY
 
-    def __init__(
-        self,
-        system: DaeSystem,
-        *,
-        structure: ConstraintStructure | None = None,
-        project: bool = True,
-    ) -> None:
+    def __init__(self, system: DaeSystem, *, structure: ConstraintStructure | None = None) -> None:
         structure = structure_of(system, structure, find_constraint_structure)
-        self._start(structure, dae_block(structure, project))
+        self._start(structure, dae_block(structure))
 
     def _start(self, structure: ConstraintStructure, block: Block) -> None:
         """Makes the system of its block."""
@@ -151,7 +144,7 @@ class DaePlant(ParameterizedSystem, Plant):
             )
 
 
-def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
+def dae_block(structure: ConstraintStructure) -> Block:
     """The motion on N* and the constraint force, (25), as a block; see `DaePlant`."""
     system, derivatives = structure.system, structure.derivatives
     manifold, control = structure.manifold, derivatives.control
@@ -163,7 +156,7 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
     if not structure.elimination.beta.nnz():
         force = ca.substitute(force, control, none)
     projection = None
-    if project and system.num_constraints:
+    if system.num_constraints:
         step = manifold.newton_step
         symbols = [ca.SX.sym(*item) for item in zip(step.input_names, step.sizes, strict=True)]
         newton = ca.Function("newton", symbols, step.function.call(symbols)[:1])
@@ -220,21 +213,15 @@ class RobotPlant(DaePlant):
 
     Args:
         model: The robot.
-        structure, project: As for `DaePlant`.
+        structure: As for `DaePlant`.
     """
 
     __slots__ = SHARED_DICTIONARY
 
-    def __init__(
-        self,
-        model: RobotModel,
-        *,
-        structure: ConstraintStructure | None = None,
-        project: bool = True,
-    ) -> None:
+    def __init__(self, model: RobotModel, *, structure: ConstraintStructure | None = None) -> None:
         structure = structure_of(model.dae, structure, find_constraint_structure)
         self.model: RobotModel = model
-        self._start(structure, robot_block(model, structure, project))
+        self._start(structure, robot_block(model, structure))
 
     @property
     def wrench_signals(self) -> Sequence[Signal]:
@@ -247,9 +234,9 @@ class RobotPlant(DaePlant):
         return {"loop_state": signals} if signals else {}
 
 
-def robot_block(model: RobotModel, structure: ConstraintStructure, project: bool = True) -> Block:
+def robot_block(model: RobotModel, structure: ConstraintStructure) -> Block:
     """The block of a constrained robot; see `RobotPlant`."""
-    block, bound = dae_block(structure, project), ConstraintSet(model.constraints)
+    block, bound = dae_block(structure), ConstraintSet(model.constraints)
     force = ca.SX.sym("force", bound.size)
     wrenches, signals = bound.wrenches(model.links.kinematics(), force)
     lambdas = block.outputs["constraint_force"]

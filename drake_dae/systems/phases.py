@@ -88,8 +88,8 @@ class Moment:
     """The measurements that decide when a phase ends, as expressions: those of `Condition`."""
 
     time: Any
-    force: Any  # of several points the sum
-    distance: Any  # of several points the mean
+    force: Any
+    distance: Any
     rate: Any  # of the distance, m/s
     wanted: Any  # the reference of the force, in contact, or of the distance
     away: Any = 0.0  # the increase of the distance since the phase began, m
@@ -179,9 +179,7 @@ class Phase:
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         """Output name -> its reference, whose time starts with the phase.
 
-        `contact_output` is the name of the force, or of the distance if the robot is free. With a
-        goal for the force of several points, their other force outputs without goals go to zero;
-        with a goal for this one of their distances, the others go to the same.
+        `contact_output` is the name of the force, or of the distance if the robot is free.
         """
         return {}
 
@@ -261,7 +259,7 @@ class Approach(Phase):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Press(Phase):
-    """The force goes smoothly to a goal; of several points, the differences of forces to zero.
+    """The force goes smoothly to a goal.
 
     Attributes:
         force: The goal, in N: a positive number, or a reference, whose time starts with the phase.

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
@@ -52,13 +51,12 @@ class Plant(System):
        values. A plant without such a port has an empty layout and no places.
     6. Parameters. `parameters` are those of a context in the order of `dae.parameters`,
        `current_parameters` the same with the current exogenous ones. `set_parameter` changes one in
-       a context; a plant with fixed numbers refuses. `further_parameters` are those that follow
-       them in numeric parameter 0, each with its place there.
+       a context; a plant with fixed numbers refuses.
     7. Starts. `set_state` sets x as given. `set_consistent_state` sets the state on N* next to a
        guess, and returns it. Both refuse wrong shapes.
     8. Contact. `is_ideal` says whether the constraints hold exactly. `friction` are the
        coefficients of friction of contacts, those of the plant, which the law may not know; not
-       negative. `add_own_view` adds the plant's own part of the Meshcat view.
+       negative.
     """
 
     __slots__ = ()
@@ -74,11 +72,6 @@ class Plant(System):
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         """Name of a further output port in a record -> names and units of its entries."""
-        return {}
-
-    @property
-    def further_parameters(self) -> Mapping[str, tuple[Signal, int]]:
-        """Name of a further parameter -> its name and unit, and its place."""
         return {}
 
     def parameters(self, context: Context) -> FloatArray:
@@ -137,9 +130,6 @@ class Plant(System):
 
     def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
         """Refuses a start of a run that is not valid, for these values of all parameters."""
-
-    def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
-        """Adds the plant's own part of the Meshcat view, with its wires, to its diagram."""
 
     def robot(self, needed_by: str) -> RobotModel:
         """The robot, or a refusal by what needs one, in words: "an animation"."""

@@ -2,25 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from math import factorial
 
 import casadi as ca
 import numpy as np
-from numpy.polynomial import Polynomial
 from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.block import TIME, Block, BlockFunction, Requirement, stacked
-from drake_dae.blocks.failures import simulation_error
+from drake_dae.blocks.block import TIME, Block, Requirement, stacked
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import Reference, ReferenceRows
-from drake_dae.references.reference import with_degrees
+from drake_dae.references.reference import stacked_expression
 from drake_dae.references.splines import PiecewisePolynomials
 from drake_dae.trace.functions import FailureKind
 
@@ -47,19 +44,14 @@ class ReferenceGenerator(TracedSystem):
 
     def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
         self.references, self.degrees = tuple(references), tuple(degrees)
-        self._base = block = reference_block(self.references, self.degrees)  # Without commands.
-        super().__init__(block, sees_steps=False)
+        super().__init__(reference_block(references, degrees), sees_steps=False)
 
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s, without commands, shape (sum (mu_i + 1),)."""
-        (values,) = self._function.evaluate(*(np.array([time]) for _ in self._function.sources))
-        if not self._function.is_valid:
-            raise simulation_error(self._function.failure(), time, np.zeros(0), {})
-        return values.copy()
-
-    @cached_property
-    def _function(self) -> BlockFunction:
-        return BlockFunction(self._base, "", {"R": self._base.outputs["reference"]})
+        context = self.CreateDefaultContext()
+        context.SetTime(time)
+        self._steps.begin(context)  # Then a time without a value is an error.
+        return np.array(self.get_output_port().Eval(context))
 
 
 def reference_block(references: Sequence[Reference], degrees: Sequence[int]) -> Block:
@@ -68,32 +60,10 @@ def reference_block(references: Sequence[Reference], degrees: Sequence[int]) -> 
         raise ReferenceSignalError(
             f"the references cover {covered} outputs, the law has {len(degrees)}"
         )
-    wholes = map(_whole, references)
+    wholes = (r.reference if isinstance(r, ReferenceRows) else r for r in references)
     ranges = (each.range for each in wholes if isinstance(each, TrajectoryReference))
-    outputs = {"reference": traced_references(references, degrees, TIME)}
+    outputs = {"reference": stacked_expression(references, degrees, TIME)}
     return Block("reference", outputs=outputs, requirements=tuple(ranges))
-
-
-def traced_references(
-    references: Sequence[Reference], degrees: Sequence[int], time: ca.SX
-) -> ca.SX:
-    """R(t) of references at a symbolic time, shape (sum (mu_i + 1), 1)."""
-    rows = [ca.SX(0, 1)]
-    for reference, its_degrees in with_degrees(references, degrees):
-        row = reference.expression(its_degrees, time)
-        if row is None:
-            raise ReferenceSignalError(
-                f"a {type(_whole(reference)).__name__} is no expression of time: define its "
-                "`expression`, or take an ExpressionReference, or wire a system of your own to the "
-                "controller's port 'reference'"
-            )
-        rows.append(row)
-    return ca.vertcat(*rows)
-
-
-def _whole(reference: Reference) -> Reference:
-    """The reference of which this one may be some rows."""
-    return reference.reference if isinstance(reference, ReferenceRows) else reference
 
 
 @checked(ReferenceSignalError)
@@ -147,7 +117,7 @@ class TrajectoryReference(Reference):
 
     @property
     def _pieces(self) -> PiecewisePolynomials:
-        """The polynomials of its segments, from their derivatives in the middle of each."""
+        """The polynomials of its segments, from the derivatives at the begin of each."""
         path, rows = self.trajectory, range(self.size)
         if isinstance(path, PiecewisePolynomial):
             breaks = np.array(path.get_segment_times())
@@ -156,16 +126,15 @@ class TrajectoryReference(Reference):
         else:
             breaks, degree = np.unique(path.basis().knots()), path.basis().order() - 1
             breaks = breaks[(breaks >= path.start_time()) & (breaks <= path.end_time())]
-        factors = np.zeros((breaks.size - 1, self.size, degree + 1))
-        for i, (begin, end) in enumerate(pairwise(breaks)):
-            middle, width = 0.5 * (begin + end), end - begin
-            taylor = [path.value(middle)[:, 0]]
-            taylor += [path.EvalDerivative(middle, k)[:, 0] for k in range(1, degree + 1)]
-            shares = Polynomial([-0.5 * width, width])  # The time from the middle.
-            for k, values in enumerate(taylor):
-                power = np.asarray((shares**k).coef, float) / factorial(k)
-                factors[i, :, : power.size] += np.outer(values, power)
-        return PiecewisePolynomials(breaks, factors)
+        powers = range(degree + 1)
+        factors = [
+            [
+                path.EvalDerivative(begin, k)[:, 0] * (end - begin) ** k / factorial(k)
+                for k in powers
+            ]
+            for begin, end in pairwise(breaks)
+        ]
+        return PiecewisePolynomials(breaks, np.swapaxes(factors, 1, 2))
 
 
 def _derivative(
@@ -221,8 +190,7 @@ class CommandedReferences(ReferenceGenerator):
         depth: int = 0,
     ) -> None:
         self.references, self.degrees = tuple(references), tuple(degrees)
-        self._base = base = reference_block(self.references, self.degrees)
-        self.commands = tuple(signals)
+        base, self.commands = reference_block(references, degrees), tuple(signals)
         command = ca.SX.sym("c", len(self.commands))
         states, rates, rows = list[ca.SX](), list[ca.SX](), list[ca.SX]()
         for i, (degree, signal) in enumerate(zip(degrees, self.commands, strict=True)):

@@ -18,6 +18,18 @@ from drake_dae.errors import ModelError
 _SAME = 1e-9  # Times that differ by less than this, in periods, count as equal.
 
 
+def one_each(what: str, given: ArrayLike, size: int, least: float = 0.0) -> FloatArray:
+    """The numbers of so many things, from one for all of them or one for each."""
+    values = numbers(what, given)
+    if values.shape not in ((), (size,)):
+        text = f"{what} has shape {values.shape}; it must be one number, or have shape ({size},)"
+        raise ModelError(text)
+    if not np.all(np.isfinite(values) & (values >= least)):
+        right = "finite" if least < 0.0 else "finite, 0 or more"
+        raise ModelError(f"{what} must be {right}, got {brief(given)}")
+    return np.broadcast_to(values, (size,))
+
+
 @checked(ModelError)
 @dataclass(frozen=True)
 class Encoders:
@@ -57,13 +69,8 @@ class Encoders:
 
     def __post_init__(self) -> None:
         for name in ("resolution", "position_noise", "velocity_noise", "position_bias"):
-            given, is_bias = numbers(name, getattr(self, name)), name == "position_bias"
-            if given.ndim > 1 or not (np.isfinite(given).all() and (is_bias or np.all(given >= 0))):
-                right = "finite" if is_bias else "0 or more"
-                raise ModelError(
-                    f"the {name} of encoders must be {right}, one number or one for each position, "
-                    f"got {brief(getattr(self, name))}"
-                )
+            given, least = getattr(self, name), -np.inf if name == "position_bias" else 0.0
+            one_each(f"the {name} of encoders", given, np.size(given), least)
         if self.velocity_bandwidth is not None:
             positive("the velocity_bandwidth of encoders", self.velocity_bandwidth)
             if np.any(self.velocity_noise):
@@ -106,16 +113,10 @@ class StateSensor(TracedSystem):
         check_whole_number("size", size, 2 * num_positions)
         self.encoders, self.sample_period = encoders, positive("period", period)
         count = num_positions
-        numbers_of = list[FloatArray]()
-        for name in ("resolution", "position_bias", "position_noise", "velocity_noise"):
-            values = np.asarray(getattr(encoders, name), dtype=float)
-            if values.shape not in ((), (count,)):
-                raise ModelError(
-                    f"the {name} of encoders has {values.size} entries, the robot has {count} "
-                    "positions"
-                )
-            numbers_of.append(np.broadcast_to(values, (count,)))
-        resolution, bias, position_noise, velocity_noise = numbers_of
+        resolution, bias, position_noise, velocity_noise = (
+            one_each(f"the {name} of encoders", getattr(encoders, name), count, -np.inf)
+            for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
+        )
         state, held = ca.SX.sym("state", size), ca.SX.sym("held", 1 + 2 * count)
         q, v = state[:count] + bias, state[count : 2 * count]
         inputs = {"state": state}
@@ -123,7 +124,7 @@ class StateSensor(TracedSystem):
             inputs["noise"] = noise = ca.SX.sym("noise", 2 * count)
             q, v = q + position_noise * noise[:count], v + velocity_noise * noise[count:]
         for i in np.flatnonzero(resolution).tolist():
-            q[i] = resolution[i] * _rounded(q[i] / resolution[i])
+            q[i] = resolution[i] * ca.floor(q[i] / resolution[i] + 0.5)
         sample, first = ca.floor(TIME / period + _SAME), ca.vertcat(q, v)
         later = first
         if encoders.velocity_bandwidth is not None:
@@ -142,14 +143,6 @@ class StateSensor(TracedSystem):
             held={"sample": Held(held, current, unknown, period, begin=begin)},
         )
         super().__init__(block)
-
-
-def _rounded(number: ca.SX) -> ca.SX:
-    """The nearest integer, halves to even as `numpy.round`."""
-    up = ca.floor(number + 0.5)
-    is_tie = ca.eq(up, number + 0.5)
-    is_odd = ca.eq(2.0 * ca.floor(up / 2.0) + 1.0, up)
-    return up - ca.logic_and(is_tie, is_odd)
 
 
 @checked(ModelError)
@@ -262,15 +255,7 @@ class ForceSensor(TracedSystem):
 
 def _errors(size: int, *errors: ArrayLike) -> FloatArray:
     """The bias, noise_deviation and drift of all forces, shape (3 m,)."""
-    found = []
-    for name, given in zip(("bias", "noise_deviation", "drift"), errors, strict=True):
-        values = numbers(name, given)
-        least = 0.0 if name == "noise_deviation" else -np.inf
-        if values.shape not in ((), (size,)) or not np.all(np.isfinite(values) & (values >= least)):
-            right = "finite, 0 or more" if least == 0.0 else "finite"
-            raise ModelError(
-                f"a ForceSensor's {name} must be {right}, a number or shape ({size},), got "
-                f"{brief(given)}"
-            )
-        found.append(np.broadcast_to(values, size))
-    return np.concatenate(found)
+    named = zip(("bias", "noise_deviation", "drift"), errors, (-np.inf, 0.0, -np.inf), strict=True)
+    return np.concatenate(
+        [one_each(f"a ForceSensor's {name}", given, size, least) for name, given, least in named]
+    )

@@ -243,50 +243,28 @@ FREE, CONTACT = 0, 1
 """The indices of the two laws of a task."""
 
 
-@dataclass(frozen=True)
-class OpeningContact:
-    """The contact of a task: one point, or several that open and close together."""
-
-    places: tuple[int, ...]  # the outputs that are its forces, or its distances where it is open
-    forces: tuple[int, ...]  # its constraint forces
-    main: int  # the output that is the sum of its forces
-
-    @property
-    def size(self) -> int:
-        return len(self.forces)
-
-    @property
-    def others(self) -> list[int]:
-        """Differences of forces, or further distances."""
-        return [place for place in self.places if place != self.main]
-
-
 @checked(ModelError)
-def open_contact(system: DaeSystem, force: str | Sequence[str]) -> DaeSystem:
+def open_contact(system: DaeSystem, force: str) -> DaeSystem:
     """A system one of whose contacts is open:
 
         x' = f + g_o v_o + h u,    0 = k_o(x),    z = (l_o(x) + m_o(x) v_o, k_i(x)),
 
-    where o are all constraints except those, i, with the named forces: they do not hold, and the
-    outputs that were their forces are their distances k_i(x).
+    where o are all constraints except i, that of the named force: it does not hold, and the output
+    that was its force is its distance k_i(x).
     """
-    forces = [force] if isinstance(force, str) else list(force)
     names = [signal.name for signal in system.constraint_input_signals]
-    for name in forces:
-        if name not in names:
-            raise ModelError(f"{system.name}: {unknown_name('constraint force', name, names)}")
+    if force not in names:
+        raise ModelError(f"{system.name}: {unknown_name('constraint force', force, names)}")
     if system.sharing is not None:
         raise ModelError(
             f"{system.name}: redundant constraints share their forces, and none of them opens; "
             "leave `compliances` out"
         )
-    contact = _contact(system, sorted({names.index(name) for name in forces}))
-    reduced = with_constraints(
-        system, [row for row in range(len(names)) if row not in contact.forces]
-    )
+    row = names.index(force)
+    place = _output_of(system, row)
+    reduced = with_constraints(system, [i for i in range(len(names)) if i != row])
     drift, signals = ca.SX(reduced.l), list(reduced.output_signals)
-    for j, i in zip(contact.places, contact.forces, strict=True):
-        drift[j], signals[j] = system.k[i], system.constraint_output_signals[i]
+    drift[place], signals[place] = system.k[row], system.constraint_output_signals[row]
     return replace(
         reduced,
         l=drift,
@@ -295,36 +273,32 @@ def open_contact(system: DaeSystem, force: str | Sequence[str]) -> DaeSystem:
     )
 
 
-def _contact(system: DaeSystem, forces: Sequence[int]) -> OpeningContact:
-    """The contact with some constraint forces; raises as `open_contact` does."""
+def _output_of(system: DaeSystem, row: int) -> int:
+    """The output that is a constraint force by itself, which no other output has."""
     m = ca.sparsify(system.m)
-    others = [i for i in range(system.num_constraints) if i not in forces]
-    places = [j for j in range(system.num_outputs) if m[j, forces].nnz()]
-    total = [j for j in places if all(m[j, i].is_one() for i in forces)]
-    is_alone = not m[places, others].nnz() and all(system.l[j].is_zero() for j in places)
-    if is_alone and len(places) == len(forces) and len(total) == 1:
-        return OpeningContact(tuple(places), tuple(forces), total[0])
-    own = ", ".join(f"'{system.constraint_input_signals[i].name}'" for i in forces)
+    places = [j for j in range(system.num_outputs) if m[j, row].nnz()]
+    alone = [j for j in places if m[j, row].is_one() and m[j, :].nnz() == 1]
+    if len(places) == 1 and alone and system.l[places[0]].is_zero():
+        return places[0]
     raise ModelError(
-        f"{system.name}: {own} must be outputs, one by itself, or of "
-        "several points as many outputs of these alone, one of them their sum, such as "
-        "ForceCombinations, so that distances can be in their places where the contact is open; "
-        f"the outputs are {listed(signal.name for signal in system.output_signals)}"
+        f"{system.name}: '{system.constraint_input_signals[row].name}' must be an output by "
+        "itself, so that its distance can be in its place where the contact is open; the outputs "
+        f"are {listed(signal.name for signal in system.output_signals)}"
     )
 
 
-def opening_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
-    """The contact that is closed in one law and open in the other."""
+def opening_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
+    """The output and the constraint force of the contact that is open in the second law."""
     closed, free = law.system, free_law.system
     names, others = (
         [signal.name for signal in system.constraint_input_signals] for system in (closed, free)
     )
-    gone = [name for name in names if name not in others]
+    gone = [row for row, name in enumerate(names) if name not in others]
     sizes = {(system.num_states, system.num_controls) for system in (closed, free)}
-    if not gone or len(sizes) > 1:
+    if len(gone) != 1 or len(sizes) > 1:
         raise ModelError(
-            f"a task needs the laws of one robot with and without a contact, as of its system and "
-            f"of open_contact(system, force); these hold {', '.join(names) or 'nothing'} and "
+            f"a task needs the laws of one robot with and without one contact, as of its system "
+            f"and of open_contact(system, force); these hold {', '.join(names) or 'nothing'} and "
             f"{', '.join(others) or 'nothing'}"
         )
     if law.deflection is not None:
@@ -335,22 +309,19 @@ def opening_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
             f"exogenous signals, as of an observer's estimates, the free law "
             f"{free_law.exogenous_degrees}; leave them, or the observer, out"
         )
-    contact = _contact(closed, [names.index(name) for name in gone])
-    distances = dict(zip(contact.places, contact.forces, strict=True))
+    row, place = gone[0], _output_of(closed, gone[0])
+    distance = closed.constraint_output_signals[row].name
+    if free.output_signals[place].name != distance:
+        raise ModelError(
+            f"the free law must have the output '{distance}' where the law has "
+            f"'{closed.output_signals[place].name}'; make its system by open_contact"
+        )
+    if free_law.degrees[place] < 2:
+        raise ModelError(f"'{distance}' must have degree 2 or more, as where forces move it")
     for i, (degree, freed) in enumerate(zip(law.degrees, free_law.degrees, strict=True)):
-        name, in_contact = free.output_signals[i].name, closed.output_signals[i].name
-        if i in distances:
-            distance = closed.constraint_output_signals[distances[i]].name
-            if name != distance:
-                raise ModelError(
-                    f"the free law must have the output '{distance}' where the law has "
-                    f"'{in_contact}'; make its system by open_contact"
-                )
-            if freed < 2:
-                raise ModelError(f"'{name}' must have degree 2 or more, as where forces move it")
-        elif degree != freed:
+        if i != place and degree != freed:
             raise ModelError(
-                f"'{name}' has degree {degree} in contact and {freed} without, so that no "
-                "reference leads from one to the other"
+                f"'{free.output_signals[i].name}' has degree {degree} in contact and {freed} "
+                "without, so that no reference leads from one to the other"
             )
-    return contact
+    return place, row

@@ -51,8 +51,8 @@ class TaskController(ParameterizedSystem, Controller):
         phase: The index of the phase in the task; after the last one their number.
         ending: 0 while the task goes on; 1 when it is done; 2 when the robot rests by "hold" or
             "leave" after a success, 3 when the task is given up.
-        desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
-            of k points. In contact the distances are zero, otherwise the forces.
+        desired_output: The desired outputs of `law`, and then the distance, shape (p + 1,). In
+            contact the distance is zero, otherwise the force.
         contact_reference: R of the law in contact while it is active, otherwise 0, as before the
             first sample; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
@@ -60,8 +60,8 @@ class TaskController(ParameterizedSystem, Controller):
         integral, free_integral: The integrals of each law, if it has any. They are not updated
             while the other law is active, no force is measured, or just after a touch.
 
-    `law` acts in contact, with the force among its outputs; of several points as many outputs are
-    forces, one of them their sum. `free_law` is for `open_contact(law.system, "wall.force")`.
+    `law` acts in contact, with the force among its outputs. `free_law` is for
+    `open_contact(law.system, "wall.force")`.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -76,11 +76,11 @@ class TaskController(ParameterizedSystem, Controller):
         self.phase_names = (*(phase.name for phase in task.all_phases), "end")
         self.sample_period = sample_period
         contact, system = opening_contact(law, free_law), law.system
-        distances = [system.constraint_output_signals[row] for row in contact.forces]
-        self.output_signals = (*system.output_signals, *distances)
-        # The columns of these distances and of their derivatives in constraint_residual.
-        first = np.cumsum([0, *law.structure.constraint_degrees])[list(contact.forces)]
-        self._distances, self._motion = first, np.concatenate([first, first + 1])
+        distance = system.constraint_output_signals[contact[1]]
+        self.output_signals = (*system.output_signals, distance)
+        # The columns of the distance and of its derivative in constraint_residual.
+        first = sum(law.structure.constraint_degrees[: contact[1]])
+        self._motion = [first, first + 1]
         block = Automaton(task, contact, (free_law, law), sample_period).block()
         super().__init__(system, block, law.exogenous_degrees, sees_steps=True)
 
@@ -120,15 +120,14 @@ class TaskController(ParameterizedSystem, Controller):
             )
 
     def _outputs(self, outputs: FloatArray, residual: FloatArray) -> FloatArray:
-        """Positions and forces, then distances."""
-        return np.concatenate([outputs, residual[..., self._distances]], axis=-1)
+        """Those of the law in contact, then the distance."""
+        return np.concatenate([outputs, residual[..., self._motion[:1]]], axis=-1)
 
     def derived(self, values: Mapping[str, FloatArray]) -> Derived:
-        """Outputs are positions, forces and distances; "phase" is 1 for the current one, else 0."""
+        """Outputs include the distance; "phase" is 1 for the current one, else 0."""
         signals, residual = self.output_signals, values["constraint_residual"]
         outputs = self._outputs(values["controlled_output"], residual)
-        own = signals[len(self.law.degrees) :]
-        motion = (*own, *(signal.derivative(1) for signal in own))
+        motion = signals[-1], signals[-1].derivative(1)
         *names, end = self.phase_names
         phases = (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal(end))
         places = values["change"][..., 1:2].astype(int)

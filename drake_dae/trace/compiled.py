@@ -15,14 +15,12 @@ import platform
 import re
 import shlex
 import shutil
-import signal
 import stat
 import subprocess
 import sys
 import tempfile
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,9 +39,8 @@ INTERPRETED = 5.5e-9  # The time of an interpreted operation, in s.
 COMPILING = {"-O1": 1.7e-4, "-O0": 4e-5}
 STARTING = 0.05  # The start-up time of a compiler, in s.
 LIMIT = 10.0  # The longest expected compilation under "auto", in s.
-# A compiler hangs if it takes this long, in s, and this many times longer than expected on an idle
-# machine.
-HANGS = (120.0, 40.0)
+# A compiler that takes longer than this hangs, in s.
+PATIENCE = 600.0
 
 
 def attempts(compiled: Compiled, operations: int) -> list[tuple[int, bool]]:
@@ -75,24 +72,21 @@ def library(
 ) -> Path | None:
     """Returns a shared library in the cache, compiled from C; None, with a warning, if not."""
     try:
-        return _library(source, operations, compiled, make, tuple(options))
+        return _library(source, operations, compiled, make, options)
     except (MachineCodeError, OSError) as error:
-        reason = f"the cache of compiled code cannot be used: {error}"
-        if isinstance(error, MachineCodeError):
-            reason = str(error)
-    if make:
-        # One text at one place: Python shows it once.
-        warnings.warn(
-            f"{reason}. Functions run interpreted, at about a tenth of the speed; that is "
-            "chosen without this warning by compiled=False (scenarios: compiled: false)",
-            MachineCodeWarning,
-            stacklevel=1,
-        )
-    return None
+        if make:
+            # One text at one place: Python shows it once.
+            warnings.warn(
+                f"{error}. Functions run interpreted, at about a tenth of the speed; that is "
+                "chosen without this warning by compiled=False (scenarios: compiled: false)",
+                MachineCodeWarning,
+                stacklevel=1,
+            )
+        return None
 
 
 def _library(
-    source: str, operations: int, compiled: Compiled, make: bool, options: tuple[str, ...]
+    source: str, operations: int, compiled: Compiled, make: bool, options: Sequence[str]
 ) -> Path | None:
     compiler, folder, level = find_compiler(), cache_folder(), _level(compiled, operations)
 
@@ -113,8 +107,7 @@ def _library(
         code, made = Path(own) / "code.c", Path(own) / "code.so"
         code.write_text(source)
         build = [*FLAGS, *compiler.target, *options, level, str(code), "-o", str(made), "-lm"]
-        patience = max(HANGS[0], HANGS[1] * (STARTING + COMPILING[level] * operations))
-        _compile([*compiler.command, *build], made, patience)
+        _compile([*compiler.command, *build], made)
         made.chmod(0o700)
         os.replace(made, stored(level))
     return stored(level)
@@ -229,11 +222,6 @@ WEB = (
     *("-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=undefined", "-Wl,--strip-all"),
     "-Wl,-z,stack-size=1048576",
 )
-WEB_PATIENCE = 600.0  # That compiler hangs if it takes longer than this, in s.
-# A compiler that takes longer than this to report its version counts as hanging, in s.
-ANSWERS = 60.0
-# Compilers that hung in this process, with the message: each is waited for once.
-_HANGING: dict[str, str] = {}
 
 
 class Compiler(NamedTuple):
@@ -246,10 +234,7 @@ class Compiler(NamedTuple):
 
 def find_compiler() -> Compiler:
     """Returns the C compiler named by CC, or else `cc`, or else that of the package ziglang."""
-    compiler = _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
-    if (name := compiler.command[0]) in _HANGING:
-        raise MachineCodeError(_HANGING[name])
-    return compiler
+    return _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
 
 
 @cache
@@ -270,9 +255,9 @@ def _find_compiler(named: str, path: str) -> Compiler:
     # Options for this processor, and the target that the compiler derives from them: it is part of
     # the identity, so that machines with a shared cache each have their own code.
     target, processor = tuple[str, ...](), ""
-    version = _run([*command, "--version"], ANSWERS)
+    version = _run([*command, "--version"])
     if not any(word.startswith(("-march", "-mcpu")) for word in command):
-        answer = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull], ANSWERS)
+        answer = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull])
         if answer.returncode == 0:
             target, processor = (NATIVE,), answer.stdout
     if "Free Software Foundation" in version.stdout:
@@ -287,12 +272,12 @@ def compile_webassembly(source: Path, file: Path) -> None:
 
     The first call on a machine compiles zig's C library as well, which takes half a minute.
     """
-    _compile([sys.executable, *WEB, str(source), "-o", str(file)], file, WEB_PATIENCE)
+    _compile([sys.executable, *WEB, str(source), "-o", str(file)], file)
 
 
-def _compile(command: list[str], file: Path, seconds: float) -> None:
+def _compile(command: list[str], file: Path) -> None:
     """Runs a command that makes a file; where it fails, raises with its first error."""
-    done = _run(command, seconds)
+    done = _run(command)
     if done.returncode or not file.exists():
         lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
         wrong = [line for line in lines if "error" in line.lower()] or lines or ["no message"]
@@ -301,23 +286,14 @@ def _compile(command: list[str], file: Path, seconds: float) -> None:
         )
 
 
-def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str]":
-    """Runs a command to its end. After a timeout it also ends the child processes."""
-    if command[0] in _HANGING:
-        raise MachineCodeError(_HANGING[command[0]])
-    options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    options |= {"stdin": subprocess.DEVNULL, "errors": "replace", "process_group": 0}
+def _run(command: list[str]) -> "subprocess.CompletedProcess[str]":
+    """Runs a command to its end."""
+    options: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace"}
     try:
-        with subprocess.Popen(command, **options) as process:
-            try:
-                said = process.communicate(timeout=seconds)
-            except BaseException:
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                raise
-        return subprocess.CompletedProcess(command, process.returncode, *said)
+        return subprocess.run(command, stdin=subprocess.DEVNULL, timeout=PATIENCE, **options)
     except subprocess.TimeoutExpired:
-        _HANGING[command[0]] = f"the C compiler '{command[0]}' takes longer than {seconds:g} s"
-        raise MachineCodeError(_HANGING[command[0]]) from None
+        raise MachineCodeError(
+            f"the C compiler '{command[0]}' takes longer than {PATIENCE:g} s"
+        ) from None
     except (OSError, ValueError) as error:
         raise MachineCodeError(f"the C compiler '{command[0]}' does not run: {error}") from None

@@ -27,7 +27,6 @@ KINKS = {
 }
 LARGE = 2.0**200
 SMOOTH = "write the one side that is needed, or a smooth function such as sqrt(x**2 + 1e-6) for |x|"
-MOST_LETTERS = 10_000  # Of a formula.
 OPERATORS: dict[type[ast.AST], Callable[..., ca.SX]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -115,17 +114,15 @@ def result_of(
 def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
     """Parses a text such as "z - 0.1*sin(x)**2", never executed as Python, to an expression.
 
-    It may have numbers, the symbols, pi, + - * / **, brackets, and sin, cos, tan, asin, acos, atan,
-    atan2, sinh, cosh, tanh, asinh, acosh, atanh, exp, log, sqrt, erf.
+    It may have numbers, the symbols, pi, + - * / **, brackets, and `FUNCTIONS`.
     """
-    if len(text) > MOST_LETTERS:
-        raise ModelError(f"a formula has at most {MOST_LETTERS} letters, this one {len(text)}")
     text, names = " ".join(text.split()), {"pi": ca.SX(ca.pi), **symbols}
     if not text:
         raise ModelError("the formula is empty; write one such as z - 0.1*sin(x)")
 
-    def wrong(place: int, what: str) -> ModelError:
-        return ModelError(f"formula '{_short(text)}', column {place + 1}: {what}")
+    def wrong(node: ast.expr, what: str) -> ModelError:
+        place = len(text.encode()[: node.col_offset].decode()) + 1
+        return ModelError(f"formula '{_short(text)}', column {place}: {what}")
 
     def value(node: ast.expr) -> ca.SX:
         piece = ast.get_source_segment(text, node) or ""
@@ -142,27 +139,24 @@ def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
             case ast.Call(ast.Name(id=name), arguments, []) if name in FUNCTIONS:
                 if len(arguments) == 1 + (name == "atan2"):
                     return getattr(ca, name)(*map(value, arguments))
-                why = f"'{_short(piece)}' has another number of values than {name} takes"
             case ast.Name(id=name):
-                why = unknown_name("name", name, names)
-            case ast.Call(ast.Name(id=name)):
-                why = f"'{_short(piece)}': {unknown_name('function', name, FUNCTIONS)}; {SMOOTH}"
-            case _:
-                why = (
-                    f"'{_short(piece)}' is not allowed; a formula has finite numbers, names, "
-                    f"+ - * / **, brackets and functions; {SMOOTH}"
-                )
-        raise wrong(len(text.encode()[: node.col_offset].decode()), why)
+                raise wrong(node, unknown_name("name", name, names))
+        raise wrong(
+            node,
+            f"'{_short(piece)}' is not allowed; a formula has finite numbers, names, + - * / **, "
+            f"brackets and {', '.join(FUNCTIONS)}; {SMOOTH}",
+        )
 
     try:
         return value(ast.parse(text, mode="eval").body)
     except ModelError:
         raise
     except SyntaxError as error:
-        place = (error.offset or 1) - 1
-        raise wrong(place, f"it cannot be read at '{_short(text[place:], 20)}'") from None
+        place = error.offset or 1
+        read = f"it cannot be read at '{_short(text[place - 1 :], 20)}'"
+        raise ModelError(f"formula '{_short(text)}', column {place}: {read}") from None
     except (ValueError, RecursionError, MemoryError):
-        raise ModelError("the formula holds a null letter, or too many brackets") from None
+        raise ModelError("the formula holds a null letter, or is too long") from None
 
 
 def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:

@@ -8,7 +8,6 @@ from functools import cached_property
 from hashlib import sha256
 from math import isfinite
 from threading import RLock, local
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -218,16 +217,12 @@ class TracedFunction:
                 f"{self.name} takes {self._num_inputs} arguments "
                 f"({', '.join(self.input_names)}), got {len(arguments)}"
             )
-        arrays: list[Any] = list(arguments)
-        for i, (argument, size) in enumerate(zip(arrays, self.sizes, strict=True)):
-            is_array = type(argument) is np.ndarray and argument.dtype == np.float64
-            if is_array and argument.shape == (size,):  # As most are.
-                continue
-            what = f"{self.name}: '{self.input_names[i]}'"
-            array = numbers(what, argument)
+        arrays = []
+        for name, argument, size in zip(self.input_names, arguments, self.sizes, strict=True):
+            array = numbers(what := f"{self.name}: '{name}'", argument)
             if array.size != size or (array.ndim > 1 and array.shape != (size, 1)):
                 raise ModelError(f"{what} has shape {array.shape}, not {(size,)}")
-            arrays[i] = array.reshape(-1)
+            arrays.append(array.reshape(-1))
         return tuple(output.copy() for output in self.evaluate(*arrays))
 
 

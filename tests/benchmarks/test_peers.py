@@ -91,7 +91,7 @@ PEERS = {"Pinocchio": pinocchio_calls, "MuJoCo": mujoco_calls}
 def test_dynamics(name, compare):
     mechanism = CASES[name]
     plant, random = DaePlant(model_of(mechanism).dae), np.random.default_rng(0)
-    block = dae_block(plant.structure, project=False)
+    block = dae_block(plant.structure)
     inputs = {"x": block.state, "u": block.inputs["control"], "p": block.parameters}
     dynamics = [
         TracedFunction("dynamics", inputs, {"rate": block.derivative}, compiled=compiled)

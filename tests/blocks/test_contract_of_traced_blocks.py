@@ -56,7 +56,7 @@ def robot(kind):
     return dd.RobotPlant(found.model, structure=found.structure)
 
 
-def found_friction(is_measured=True):
+def found_friction():
     """The law of the arm on a wall whose friction is found."""
     found = arm("two_link")
     smooth = found.model.constraints[0]
@@ -64,7 +64,7 @@ def found_friction(is_measured=True):
     model = dd.RobotModel(found.model.links, [wall], found.model.outputs, [1.2, -1.6])
     names = [signal.name for signal in model.links.velocity_signals]
     dae = with_disturbance(model.dae, names, ["wall.friction"])
-    return dd.TrackingLaw(dae, dd.poles(-4.0), measured_force=is_measured)
+    return dd.TrackingLaw(dae, dd.poles(-4.0), measured_force=True)
 
 
 def observer(**more):
@@ -73,10 +73,10 @@ def observer(**more):
     return dd.StateEstimator(found_friction(), rates, 0.01, 0.5, 0.02)
 
 
-def estimator(lag, law=None, **more):
+def estimator(lag, **more):
     rates = Observing(10.0, force_rate=15.0, state_rate=30.0, **more)
     return dd.StateEstimator(
-        law or found_friction(), rates, 0.01, lag, 0.02, lag * 0.01, 1e-3, [1e-2, 0.0]
+        found_friction(), rates, 0.01, lag, 0.02, lag * 0.01, 1e-3, [1e-2, 0.0]
     )
 
 
@@ -124,7 +124,6 @@ BLOCKS = {
     ),
     "StateEstimator of exact states behind springs": observer_behind_springs,
     "StateEstimator": lambda: estimator(0.5, least_force=1e-3),
-    "StateEstimator without a force sensor": lambda: estimator(0.5, law=found_friction(False)),
     "StateEstimator of a discrete plant": lambda: estimator(1.0, least_force=1e-3),
     "StateEstimator of a contact that sticks": lambda: estimator(
         0.5, least_speed=1e3, least_force=1e-3

@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from drake_dae import contact_gains
+from drake_dae.errors import AdviceWarning
 
 
 def test_one_sample_at_a_kilohertz_gives_the_rate_of_the_docstring():
@@ -36,29 +37,6 @@ def test_noise_of_the_force_is_that_of_the_docstring():
 
 
 @pytest.mark.parametrize("sample_time", [2.5e-4, 1e-3, 4e-3])
-@pytest.mark.parametrize("noise", [0.0, 1e-3])
-def test_contact_that_is_sampled_late_comes_to_rest(sample_time, noise):
-    """All soft contacts, and stiff ones up to a swing of half a radian in a sample.
-
-    (phi, phi', the force's integral, what is held): phi'' = -A k phi + held, where the law of one
-    sample before holds A (r - K_i int e) - c phi'; the roots of its map are inside the circle.
-    """
-    for frequency in (10.0, 30.0, 100.0, 0.5 / sample_time):
-        mobility = 0.1
-        stiffness = frequency**2 / mobility
-        found = contact_gains(stiffness, mobility, sample_time, velocity_noise=noise)
-        if not found.constraint_damping:
-            continue
-        rates = np.array([[0.0, 1.0, 0.0], [-(frequency**2), 0.0, 1.0], [0.0, 0.0, 0.0]])
-        step = expm(rates * sample_time)[:2]
-        loop = np.zeros((4, 4))
-        loop[:2, [0, 1, 3]] = step
-        loop[2] = [-stiffness * sample_time, 0.0, 1.0, 0.0]
-        loop[3] = [0.0, -found.constraint_damping, found.force_gain * mobility, 0.0]
-        assert np.abs(np.linalg.eigvals(loop)).max() < 1.0, frequency
-
-
-@pytest.mark.parametrize("sample_time", [2.5e-4, 1e-3, 4e-3])
 def test_positions_that_are_sampled_late_come_to_rest(sample_time):
     """e'' = held, with the poles of one sample before; damped nearly as the poles without it.
 
@@ -84,10 +62,9 @@ def test_gains_are_advised_in_silence_only_where_neighbours_come_to_rest(swing, 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         found = contact_gains(frequency**2 / mobility, mobility, T, delay, 0.0)
-    if told:
-        assert swing > {0: 1.3, 1: 0.6, 2: 0.36}[delay]
-        return
-    for factor in (0.3, 1.0, 1.1, 2.0):
+
+    def share_left(factor):
+        """Of the motion, after 3,000 samples of a contact of another stiffness."""
         own = frequency * factor**0.5
         step = expm(T * np.array([[0.0, 1.0, 0.0], [-(own**2), 0.0, 1.0], [0.0, 0.0, 0.0]]))[:2]
         (place, speed), total, held = (1.0, 0.0), 0.0, [0.0] * delay
@@ -97,4 +74,14 @@ def test_gains_are_advised_in_silence_only_where_neighbours_come_to_rest(swing, 
             total += found.force_gain * own**2 * T * place
             place, speed = step @ [place, speed, held.pop(0)]
             sizes.append(abs(place))
-        assert max(sizes[-300:]) < 0.5 * max(sizes[:300]), factor
+        return max(sizes[-300:]) / max(sizes[:300])
+
+    if not told:
+        assert max(map(share_left, (0.3, 1.0, 1.1, 2.0))) < 0.5
+        return
+    assert [one.category for one in told] == [AdviceWarning]
+    assert swing > {0: 1.3, 1: 0.6, 2: 0.36}[delay]
+    # The stiffness that is named does not come to rest indeed, unless samples do not show it.
+    factor = float(str(told[0].message).split("which is ")[1].split(" times")[0])
+    if swing * factor**0.5 < 3.1:
+        assert not share_left(1.02 * factor) < 0.05

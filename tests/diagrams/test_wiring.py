@@ -15,14 +15,14 @@ REFERENCES = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
 MOTORS = dd.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 
 
-def rigid(sensor=None, gain=1.0, measured=True):
+def rigid(sensor=None, gain=1.0):
     found = arm("two_link")
     law = dd.TrackingLaw(
         found.model.dae,
         dd.poles(-8.0),
         structure=found.structure,
-        measured_force=measured,
-        force_gain=gain if measured else 0.0,
+        measured_force=True,
+        force_gain=gain,
     )
     plant = dd.RobotPlant(found.model, structure=found.structure)
     return dd.make_closed_loop(plant, law, REFERENCES, LoopSettings(sensor=sensor))
@@ -40,11 +40,6 @@ def test_a_sampled_loop_that_diverges_is_refused():
     rigid(dd.ForceSensor(1, time_constant=0.05, sample_period=0.01), gain=10.02)
     with pytest.raises(WiringError, match="force_gain"):
         rigid(dd.ForceSensor(1, time_constant=0.05, sample_period=0.01), gain=10.04)
-
-
-def test_a_sensor_that_no_law_uses_is_refused():
-    with pytest.raises(WiringError, match="measured_force"):
-        rigid(dd.ForceSensor(1, 0.01), measured=False)
 
 
 def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():

@@ -53,22 +53,6 @@ def test_a_page_is_compared_to_the_digits_that_it_shows():
             compare(shown, printed)
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("# T\n\n```python\nx = 1\n1 / 0\n```\n", 4),
-        ("# T\n\n```python\nprint(1)\n```\n\n```text\n2\n```\n", 4),
-        ("# T\n\n```console\n$ false\n```\n", 4),
-    ],
-)
-def test_block_that_fails_is_named_by_its_line(text, line, tmp_path, monkeypatch):
-    page = tmp_path / "page.md"
-    page.write_text(text, "utf-8")
-    monkeypatch.setattr("book.pages.BOOK", tmp_path)
-    with pytest.raises(PageError, match=rf"page.md, line {line}: "):
-        run_page(page, tmp_path / "page")
-
-
 def test_links_lead_to_pages_files_and_headings():
     written = ("names", "keys", "commands", "equations")
     made = {BOOK / "gallery.md", *(BOOK / "reference" / f"{name}.md" for name in written)}

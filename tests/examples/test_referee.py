@@ -1,19 +1,15 @@
 """The referee of `tests/benchmarks`: its values by other routes, and drake_dae beside them."""
 
 import importlib
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mpmath import mp, mpf
 from numpy.testing import assert_allclose
-from referee import compare
 from referee.compare import (
     compare_motion,
     compare_state,
     find_engines,
-    main,
     state_of,
     table,
     wanted_forces,
@@ -169,15 +165,3 @@ def test_an_engine_that_is_missing_is_one_sentence(monkeypatch):
     text = table("mechanism", [ours.NAME], {"pendulum": {ours.NAME: "it cannot"}})
     assert "| pendulum | - |" in text
     assert "- drake_dae, pendulum: it cannot." in text
-
-
-def test_the_command_prints_a_table_and_keeps_that_of_all_mechanisms(monkeypatch, capsys):
-    page = Path(compare.__file__).with_name("table.md")
-    before = page.read_text()
-    monkeypatch.setattr(compare, "ENGINES", ("ours",))
-    main(["gears"])
-    # 12 digits or more, in the state and after the motion.
-    assert re.findall(r"^\| gears(.*) \| 1\d ", capsys.readouterr().out, re.M) == ["", ", 0.2 s"]
-    assert page.read_text() == before
-    with pytest.raises(SystemExit, match="gear; there are"):
-        main(["gear"])

@@ -57,15 +57,14 @@ def test_few_rows_are_met_within_the_tolerance(strokes, length, times, order, tm
         function = path.derivatives([0, 0])
         off = np.array([np.abs(function(row[0]) - row[1:]) for row in path.table])
         assert np.all(off.max(axis=0) <= share * np.ptp(path.table[:, 1:], axis=0))
-        np.testing.assert_allclose(path.deviation, off.max(axis=0), atol=1e-14 * length)
-        assert f"{off[:, 0].max():.2g} in y, " in path.remark
 
 
 def test_smoothing_that_loses_the_rows_is_refused_with_what_is_lost(tmp_path):
     """With 2 s between points, as rows have along strokes, half of each stroke is lost."""
     file = str(raster(tmp_path, 6, 0.16, (2.0, 0.5)))
     wide = CsvReference(file, ["z", "y"], smoothing=2.0, tolerance=1.0)
-    off = wide.deviation[1]
+    function = wide.derivatives([0, 0])
+    off = max(abs(function(row[0])[1] - row[2]) for row in wide.table)
     assert off > 0.03
     with pytest.raises(ReferenceSignalError, match=rf"{off:.3g}.*'y'"):
         CsvReference(file, ["z", "y"], smoothing=2.0).derivatives([2, 2])
@@ -92,7 +91,6 @@ def test_columns_are_found_by_name_and_held_at_the_ends(delimiter, tmp_path):
         ("t,y\n0,1\n1,inf\n", r"row 3, y: .*'inf'"),
         ("t,y\n0,1\n1_0,2\n", r"row 3, t: .*'1_0'"),
         ("t;y\n0;1,5\n1;2,5\n", r"row 2, y: .*'1,5'"),
-        ("t,y\n0,1\n1,1e300\n", r"row 3, y: .*'1e300'"),
         ("t,y\n0,1\n1,2\n1,3\n", r"t .*row 4"),
         (b"\xff\xfe\x00", r"wave\.csv"),
     ],

@@ -86,7 +86,7 @@ def test_a_function_may_take_parameters():
     ("formula", "numbers", "words"),
     [
         ("z - q*x", {}, "'q'"),
-        ("z - sine(x)", {}, "'sine'"),
+        ("z - sine(x)", {}, "sine"),
         ("z - min(x, 1)", {}, "'min(x, 1)'"),
         ("z - x^2", {}, "'z - x^2'"),
         ("atan2(x)", {}, "'atan2(x)'"),
@@ -94,7 +94,7 @@ def test_a_function_may_take_parameters():
         ("__import__('os').system('ls')", {}, "__import__"),
         ("x.__class__", {}, "'x.__class__'"),
         ("z - 1e999", {}, "1e999"),
-        ("z" + " + z" * 3000, {}, "10000"),
+        ("z" + " + z" * 3000, {}, "long"),
         ("(" * 900 + "z" + ")" * 900, {}, "formula"),
         ("z - \0", {}, ""),
         ("1 + a", {"a": 1.0}, "x, y"),

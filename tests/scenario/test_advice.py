@@ -68,7 +68,7 @@ def test_what_is_left_out_is_advised_and_reported():
     assert run.estimator.force_rate == pytest.approx(wanted.observer_force_rate, rel=1e-2)
     assert run.sensors.force == parts.MeasuredForce(sample_period=1e-3)
     assert loop.observer is not None
-    assert loop.observer.friction_signals[0].name == "wall.friction"
+    assert loop.signals["friction"][0].name == "wall.friction"
 
 
 def test_an_estimator_estimates_what_it_can_unless_parameters_are_named():
@@ -85,7 +85,7 @@ def test_an_estimator_estimates_what_it_can_unless_parameters_are_named():
         (): {*joints, *tilts, *load, "wall.friction"},
         ("estimator.parameters=[]",): set(),
     }
-    assert loop.observer.friction_signals[0].name == "wall.friction"
+    assert loop.signals["friction"][0].name == "wall.friction"
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_what_cannot_be_estimated_refuses_no_run(monkeypatch):
     monkeypatch.setattr(build, "estimating_all", impossible)
     completed, loop = build_completed(two_link("constraints.0.friction=0.0"))
     assert any("tool_load.mass" in note for note in completed.notes)
-    assert loop.observer.friction_signals[0].name == "wall.friction"
+    assert loop.signals["friction"][0].name == "wall.friction"
 
 
 def test_encoders_are_estimated_at_rates_for_their_noise():

@@ -15,68 +15,37 @@ from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.references import PathLimits
 from drake_dae.scenario import parts as forms
 from drake_dae.scenario.robot_file.robot import Pose, Robot
-from drake_dae.scenario.scenario import (
-    Scenario,
-    SurfaceCoordinatesForm,
-    WeldedFramesForm,
-    save_scenario,
-)
+from drake_dae.scenario.scenario import Scenario, WeldedFramesForm, save_scenario
 from drake_dae.scenario.shipped import find_scenario
 
 LIMITS = PathLimits(0.2, 1.0)
 
 
-def test_every_form_reads_back_equal(tmp_path):
-    surfaces = [
-        dd.Plane((1, 2, 3), (0.2, 0.3, 0.7)),
-        dd.Sphere((1, 2, 3), 0.1, (1, 0, 0), True),
-        dd.Cylinder((1, 2, 3), (0, 1, 0), 1 / 3),
-        dd.Ellipsoid((1, 2, 3), (0.1, 0.2, 0.3)),
-        dd.Torus((1, 2, 3), (0, 0, 1), 0.5, 0.1),
-    ]
+def test_forms_that_no_shipped_scenario_has_read_back_equal(tmp_path):
+    surfaces = dd.Ellipsoid((1, 2, 3), (0.1, 0.2, 0.3)), dd.Torus((1, 2, 3), (0, 0, 1), 0.5, 0.1)
     scenario = Scenario(
         description="on: ä # 'quoted'\nsecond line",
         robot=Robot("/some/where.urdf", {"other": "/else/where"}),
         constraints=[
-            *[
-                dd.PointOnSurface("a", surface, (0.1, 1e-17, -0.0), f"c{i}")
-                for i, surface in enumerate(surfaces)
-            ],
+            dd.PointOnSurface("a", surfaces[1], (0.1, 1e-17, -0.0), "c"),
             WeldedFramesForm("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
-            dd.CoincidentPoints("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), "zx", "p"),
             dd.FixedDistance("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), 1 / 3, "r"),
             dd.JointCoupler("a", "b", -1 / 3, 0.1, "m", "j"),
-            dd.AxisNormalToSurface("a", surfaces[3], (0.0, 0.6, -0.8), (0.1, 0.2, 0.3), "n"),
-            dd.RollingWheel("a", 0.1, (1, 0, 0), (0.1, 0.2, 0.3), (0, 1, 0), False, "l"),
+            dd.AxisNormalToSurface("a", surfaces[0], (0.0, 0.6, -0.8), (0.1, 0.2, 0.3), "n"),
         ],
-        outputs=[
-            dd.PointCoordinates("yes", "xy"),
-            dd.AxisCoordinates("b", "z", "xy"),
-            SurfaceCoordinatesForm("c0"),
-            dd.JointPositions(["joint1", "2"]),
-        ],
-        forces=[
-            "l.traction",
-            "c0.force",
-            dd.Squeeze("a", "w", "p"),
-            dd.ForceCombination({"c1.force": 1 / 3, "c2.force": -1.0}, "d"),
-        ],
+        outputs=[dd.PointCoordinates("yes", "xy"), dd.JointPositions(["joint1", "2"])],
+        forces=["c.force", dd.ForceCombination({"c.force": 1 / 3, "r.thrust": -1.0}, "d")],
         actuation=[
             dd.FlexibleJoints([[8e3, 5e2], [5e2, 6e3]], [1.0, 1 / 3], 2.0),
-            dd.DcMotors(0.1, np.array([1e-3, 2e-3]), 0.5),
             dd.ElectrohydraulicServos(1e6, np.diag([1e-6, 2e-6]), np.eye(2)),
         ],
         sensors=forms.Sensors(force=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0])),
         law=forms.Law(
-            forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]),
-            force_gain=np.eye(2),
+            forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]), force_gain=2.0
         ),
         references={
-            "a": dd.ConstantReference([1.0]),
-            "b": dd.SinusoidReference(1.0, [2.0], [3.0], [4.0]),
             "c.d, e": dd.PointToPointReference([0.0], [1.0], 0.5, 2.0, 4),
             "f": 2.0,
-            "g": dd.LineReference([0, 1], [1, 2], LIMITS),
             "h": dd.CircleReference([0, 1], 0.1, limits=LIMITS, turns=-2.0, phase=0.5),
             "i": dd.PolylineReference([[0, 0], [1, 0], [1, 1]], LIMITS, 0.1, order=3),
             "j": dd.WaypointsReference([[0, 0], [1, 0]], [0, 2], order=2),

@@ -139,51 +139,36 @@ class SpringyPlant(LeafSystem, Plant):
         change = -ca.solve(structure.elimination.constraint_matrix, back)
         moved = ca.solve(ca.densify(dae.mass_matrix), ca.mtimes(dae.g, change))
         force = exact + change
-        self._rate = dae.trace(
-            "rate", {"rate": derivatives.expand(derivatives.rate) + moved}, {"control": control}
-        )
-        shown = {
+        links = model.links.q.numel() + model.links.v.numel()
+        expressions = {
+            "rate": derivatives.expand(derivatives.rate) + moved,
             "constraint_force": dae.forces(force),
             "controlled_output": dae.l + ca.mtimes(dae.m, force),
+            "state": dae.state,
+            "link_state": dae.state[:links],
+            "constraint_residual": residual,
         }
-        self._shown = {
-            n: dae.trace(n, {n: value}, {"control": control}) for n, value in shown.items()
-        }
-        self._residual = dae.trace("residual", {"residual": residual})
-        links = model.links.q.numel() + model.links.v.numel()
+        traced = {n: dae.trace(n, {n: e}, {"control": control}) for n, e in expressions.items()}
+        self._rate = traced.pop("rate")
 
         self.set_name(dae.name)
         self.DeclareContinuousState(BasicVector(structure.manifold.project(dae.nominal_state)))
         self._control = self.DeclareVectorInputPort("control", dae.num_controls)
-        of_state = {self.xc_ticket()}
-        for name, size in {"state": dae.num_states, "link_state": links}.items():
+        for name, function in traced.items():
+            steered = name in ("constraint_force", "controlled_output")
             self.DeclareVectorOutputPort(
                 name,
-                size,
-                lambda c, out, size=size: out.SetFromVector(self.state(c)[:size]),
-                of_state,
+                expressions[name].numel(),
+                lambda c, out, f=function, s=steered: out.SetFromVector(self._value(f, c, s)),
+                {self.all_sources_ticket() if steered else self.xc_ticket()},
             )
-        for name, function in self._shown.items():
-            self.DeclareVectorOutputPort(
-                name,
-                function.function.numel_out(0),
-                lambda c, out, f=function: out.SetFromVector(
-                    f(self.state(c), self._control.Eval(c), dae.parameter_values)[0]
-                ),
-            )
-        self.DeclareVectorOutputPort(
-            "constraint_residual",
-            residual.numel(),
-            lambda c, out: out.SetFromVector(
-                self._residual(self.state(c), dae.parameter_values)[0]
-            ),
-            of_state,
-        )
+
+    def _value(self, function, context, steered=True):
+        control = self._control.Eval(context) if steered else np.zeros(self.dae.num_controls)
+        return function(self.state(context), control, self.dae.parameter_values)[0]
 
     def DoCalcTimeDerivatives(self, context, derivatives):
-        control = self._control.Eval(context)
-        found = self._rate(self.state(context), control, self.dae.parameter_values)
-        derivatives.SetFromVector(found[0])
+        derivatives.SetFromVector(self._value(self._rate, context))
 
 
 class RestingController(LeafSystem, Controller):

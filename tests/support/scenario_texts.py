@@ -65,28 +65,6 @@ duration: 1.0
 """
 
 
-TWO_LINK = "robot: {file: package://drake_dae_models/two_link_arm.urdf}"
-
-ROD = f"""{TWO_LINK}
-constraints:
-- !FixedDistance
-  frame_a: world
-  point_a: [1.6, 0.0, 0.0]
-  frame_b: tool
-  point_b: [0.0, 0.0, 0.0]
-  length: 0.7
-outputs: [!PointCoordinates {{frame: tool, axes: z}}]
-law:
-  gains: !Poles {{all: [-4.0]}}
-references:
-  tool.z: !Sinusoids {{offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}}
-  rod.thrust: 30.0
-start: {{positions: {{joint1: 1.2, joint2: -1.6}}, errors: {{tool.z: 0.02}}}}
-"""
-END = """duration: 0.5
-integrator: {integration_scheme: runge_kutta5, accuracy: 1.0e-8, use_error_control: true}
-"""
-
 # At rest 20 mm before the wall, whose friction the law takes for zero.
 OBSERVED = """
 robot: {file: package://drake_dae_models/two_link_arm.urdf}
@@ -125,7 +103,7 @@ SHORT = task_text("""
   - !Press {force: 10, over: 0.1}
   - !Move {references: {tool.z: 0.31, wall.force: 12}, duration: 0.2, over: 0.2}
 """)
-TEXTS = {"rod": ROD + END, "task": SHORT, "observed_task": OBSERVED}
+TEXTS = {"task": SHORT, "observed_task": OBSERVED}
 
 
 def written(name, folder):

@@ -29,8 +29,8 @@ from pydrake.multibody.plant import (
 )
 from pydrake.multibody.tree import PrismaticJoint, SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, OutputPortSelection
-from pydrake.systems.primitives import ConstantVectorSource, FirstOrderTaylorApproximation
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
 from runs import some
 
 import drake_dae as dd
@@ -379,24 +379,3 @@ def test_a_constraint_that_is_no_contact_is_refused():
     model = dd.RobotModel(links, [pin], [dd.PointCoordinates("tool", "z")])
     with pytest.raises(ModelError, match="'pin'"):
         dd.CompliantPlant(model, PointMaterial())
-
-
-def test_the_continuous_plant_has_the_linear_model_of_differences():
-    """Central differences of 1e-7 in contact at rest leave 1e-5 of slopes up to k / m."""
-    plant = dd.CompliantPlant(sled(), PointMaterial(0.0, stiffness=1e4, dissipation=1.0))
-    context = plant.CreateDefaultContext()
-    start, control = np.array([0.0, -1e-3, 3e-4, 1e-3]), np.array([1.0, -10.0])
-    plant.set_state(context, start)
-    port = plant.GetInputPort("control")
-    port.FixValue(context, control)
-    found = FirstOrderTaylorApproximation(
-        plant, context, port.get_index(), OutputPortSelection.kNoOutput
-    )
-
-    def rate(state):
-        plant.set_state(context, state)
-        return plant.EvalTimeDerivatives(context).CopyToVector()
-
-    steps = 1e-7 * np.eye(4)
-    wanted = np.array([(rate(start + step) - rate(start - step)) / 2e-7 for step in steps]).T
-    assert_allclose(found.A(), wanted, rtol=0.0, atol=1e-5 * np.abs(wanted).max())

@@ -22,7 +22,7 @@ from drake_dae import (
     build_scenario,
     poles,
 )
-from drake_dae.dae.disturbance import ChainFilter, transition
+from drake_dae.dae.disturbance import filter_gain, transition
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import roll_scenario
 from drake_dae.systems import ControlHold, Observing
@@ -86,9 +86,9 @@ def observed(
 
 def error_step(ratio=None):
     """(1 - K H) F of the error of (q, v, a) over a sample, and K."""
-    found = ChainFilter.of(FAST, SLOW, T, ratio)
-    shown = np.eye(3)[: found.gain.shape[1]]
-    return (np.eye(3) - found.gain @ shown) @ transition(T), found
+    found = filter_gain(FAST, SLOW, T, ratio)
+    shown = np.eye(3)[: found.shape[1]]
+    return (np.eye(3) - found @ shown) @ transition(T), found
 
 
 def test_errors_of_the_estimate_are_those_of_the_filter():
@@ -121,7 +121,7 @@ def test_noise_leaves_the_deviations_of_the_filter(ratio):
     noise = 1e-3
     states, estimates, _ = observed(0.0, 60.0, noise, 0.0 if ratio is None else ratio * noise)
     step, found = error_step(ratio)
-    each = found.gain @ np.diag([1.0, ratio or 0.0][: found.gain.shape[1]])
+    each = found @ np.diag([1.0, ratio or 0.0][: found.shape[1]])
     wanted = noise * np.sqrt(np.diag(solve_discrete_lyapunov(step, each @ each.T)))[:2]
     assert_allclose(np.std((states - estimates)[200:], axis=0), wanted, rtol=0.12)
 
@@ -152,37 +152,11 @@ def test_encoders_alone_track_as_promised_and_innovations_are_consistent():
 def in_band(loop, record):
     """Whether the squared residuals of each sample after 2 s are in their band of 95 per cent."""
     observing, late = loop.observer.observing, record.time > 2.0
-    found = ChainFilter.of(observing.state_rate, observing.rate, 1e-3, 0.01 / 5e-5)
+    gain = filter_gain(observing.state_rate, observing.rate, 1e-3, 0.01 / 5e-5)
     residual = (record["measured_state"] - record["estimated_state"])[late, :7]
-    squares = np.sum(residual**2, axis=1) / (5e-5**2 * (1.0 - found.covariance[0, 0]))
+    squares = np.sum(residual**2, axis=1) / (5e-5**2 * (1.0 - gain[0, 0]))
     low, high = chi2.ppf([0.025, 0.975], 7)
     return (low < squares) & (squares < high)
-
-
-@pytest.mark.slow
-def test_without_a_force_sensor_the_force_is_that_of_the_model():
-    """Below 0.1 mm and 0.5 N on a plant without model errors except its friction."""
-    points = ", ".join(f"tool.{axis}: [15625.0, 1250.0, 50.0]" for axis in "yz")
-    names = ("tool.z_axis.y", "tool.z_axis.z", "joint3", "joint7")
-    others = ", ".join(f"{name}: [625.0, 35.4]" for name in names)
-    loop, record = roll(
-        scenario(
-            "wall_point_contact",
-            "plant=!CompliantContact {time_step: 0.001, friction: 0.3}",
-            "sensors.encoders={resolution: 1.0e-5}",
-            f"law.gains=!Coefficients {{outputs: {{{points}, {others}}}}}",
-            "law.integral=[tool.y, tool.z]",
-            "estimator={rate: 33, friction_rate: 8, state_rate: 333, parameters: [wall.friction]}",
-            "duration=4",
-        )
-    )
-    assert not loop.controller.law.measured_force
-    late = record.time > 2.0
-    error = record["tracking_error"][late]
-    assert np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1))) < 1e-4
-    assert np.sqrt(np.mean(error[:, -1] ** 2)) < 0.5
-    missed = record["estimated_force"][late] - record["constraint_force"][late]
-    assert np.sqrt(np.mean(missed**2)) < 0.5
 
 
 @pytest.mark.slow

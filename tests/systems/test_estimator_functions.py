@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from drake_dae import JointFriction, RobotModel, StateEstimator, TrackingLaw, poles
 from drake_dae.dae import with_disturbance
-from drake_dae.dae.disturbance import ChainFilter
+from drake_dae.dae.disturbance import filter_gain
 from drake_dae.systems import Observing
 
 T = 1e-3
@@ -31,7 +31,7 @@ def law(friction: float = 0.0):
 
 def gain(rate):
     """K_1, K_2, K_3 of a position."""
-    return ChainFilter.of(RATES.state_rate, rate, T).gain[:, 0]
+    return filter_gain(RATES.state_rate, rate, T)[:, 0]
 
 
 def sample(measured, v, forces, controls, step=0.0, lag=0.0, mu=0.0, friction=0.0, slid=1e3):

@@ -171,11 +171,6 @@ def test_the_linear_model_knows_what_moves():
     assert (found.minimal.C.shape, found.minimal.D.shape) == ((0, 2), (0, 2))
 
 
-def test_what_moves_must_be_a_parameter():
-    with pytest.raises(ModelError, match=r"'lenght'.*'length'"):
-        rod(exogenous=["lenght"])
-
-
 def test_chains_that_need_too_many_derivatives_are_refused():
     x, w = ca.SX.sym("x", 12), dd.Parameter("w", 0.0, exogenous=True)
     system = dd.DaeSystem(

@@ -10,6 +10,7 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, Ra
 from runs import some
 
 import drake_dae as dd
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import GainError, ModelError
 from drake_dae.running import start_values
 
@@ -26,45 +27,27 @@ def run(
 
     The sensor starts with the force reference and `felt` newtons more.
 
-    Returns the times, the errors z - r (k, 2), and the last plant state and reference.
+    Returns the times and the errors z - r, shape (k, 2).
     """
     chosen = dd.TrackingLaw(model.dae, dd.poles(-10.0), measured_force=measured, force_gain=gain)
-    builder = DiagramBuilder()
-    plant = builder.AddSystem(dd.RobotPlant(model, structure=chosen.structure))
-    controller = builder.AddSystem(dd.TrackingController(chosen))
-    reference = builder.AddSystem(dd.ReferenceGenerator(references, chosen.degrees))
-    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
-    builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
-    builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
-    force = plant.GetOutputPort("constraint_force")
-    if sensor is not None:
-        builder.AddSystem(sensor)
-        builder.Connect(force, sensor.GetInputPort("force"))
-        force = sensor.GetOutputPort("measured_force")
-    if measured:
-        builder.Connect(force, controller.GetInputPort("measured_force"))
-    for port in ("state", "controlled_output"):
-        builder.ExportOutput(plant.GetOutputPort(port), port)
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    model_context = controller.GetMyMutableContextFromRoot(context)
-    mass = controller.get_parameter(model_context, "link2.mass")
-    controller.set_parameter(model_context, "link2.mass", wrong * mass)
-    r = reference.reference(0.0)
-    second = chosen.degrees[0] + 1
-    q = model.configuration([r[0]], [1.2, -1.6])
+    plant = dd.RobotPlant(model, structure=chosen.structure)
+    loop = dd.make_closed_loop(plant, chosen, references, LoopSettings(sensor=sensor))
+    context, controller = loop.diagram.CreateDefaultContext(), loop.controller
+    own = controller.GetMyMutableContextFromRoot(context)
+    mass = controller.get_parameter(own, "link2.mass")
+    controller.set_parameter(own, "link2.mass", wrong * mass)
+    places = chosen.layout.lowest
+    height, force = loop.reference.reference(0.0)[places]
+    q = model.configuration([height], [1.2, -1.6])
     plant.set_consistent_state(
-        plant.GetMyMutableContextFromRoot(context), model.rest_state(q, [r[second]])
+        plant.GetMyMutableContextFromRoot(context), model.rest_state(q, [force])
     )
     if sensor is not None:
-        sensor.set_force(sensor.GetMyMutableContextFromRoot(context), [r[second] + felt])
+        sensor.set_force(sensor.GetMyMutableContextFromRoot(context), [force + felt])
     times = np.linspace(0.0, duration, round(100 * duration) + 1)
-    (found,) = dd.rollout(diagram, *start_values(diagram, context), times, config=fixed_step())
+    (found,) = dd.rollout(loop, *start_values(loop, context), times, config=fixed_step())
     assert found.failure is None
-    wanted = np.array([reference.reference(t)[[0, second]] for t in times])
-    errors = found.record["controlled_output"] - wanted
-    state = found.record["state"][-1]
-    return times, errors, chosen, state, controller.parameters(model_context)
+    return times, found.record["tracking_error"]
 
 
 @pytest.mark.slow
@@ -77,8 +60,8 @@ def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
         [MOVE[0], dd.SinusoidReference(20.0, 5.0, 0.5)],
         dd.ForceSensor(1, time_constant=2e-3),
     )
-    times, without, *_ = run(model, slow)
-    _, feedback, *_ = run(model, slow, measured=True, gain=gain, sensor=sensor)
+    times, without = run(model, slow)
+    _, feedback = run(model, slow, measured=True, gain=gain, sensor=sensor)
     later = times > 1.0
     largest = np.max(np.abs(without[later, 1]))
     assert largest > 1.0
@@ -93,8 +76,8 @@ def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
 def test_measured_force_removes_the_static_error_behind_motors(stage):
     """At rest I_a' = 0 and the model's lambda' is 0, so (81) leaves Lambda_4 (lambda - r_2) = 0."""
     model = touching("two_link", [stage])
-    _, without, *_ = run(model, HOLD, duration=3.0)
-    _, feedback, *_ = run(model, HOLD, duration=3.0, measured=True)
+    _, without = run(model, HOLD, duration=3.0)
+    _, feedback = run(model, HOLD, duration=3.0, measured=True)
     assert abs(without[-1, 1]) > 1.0
     # The slowest mode is the pole at -10: exp(-30) of a few newtons.
     assert abs(feedback[-1, 1]) < 1e-6 * abs(without[-1, 1])
@@ -145,13 +128,13 @@ def test_law_59_with_measured_force():
         np.testing.assert_allclose(difference, gain * 6.0 * np.array(jacobian), rtol=1e-9)
 
 
-@pytest.mark.parametrize("gain", [0.5, 1.5])
+@pytest.mark.parametrize("gain", [0.5, 0.95])
 def test_a_sampled_loop_multiplies_the_error_by_minus_g(gain):
     """One-sample delay: stable below 1."""
     sensor = dd.ForceSensor(1, sample_period=0.02)
     model = arm("two_link").model
     given = {"wrong": 1.0, "felt": 1.0, "duration": 0.2}
-    times, error, *_ = run(model, HOLD, measured=True, gain=gain, sensor=sensor, **given)
+    times, error = run(model, HOLD, measured=True, gain=gain, sensor=sensor, **given)
     middle = np.isclose(times % 0.02, 0.01)
     ratios = error[middle, 1][1:] / error[middle, 1][:-1]
     np.testing.assert_allclose(ratios, -gain, rtol=1e-6)
@@ -163,7 +146,7 @@ def test_the_lagged_loop_decays_at_1_plus_g_over_tau():
     model = arm("two_link").model
     given = {"wrong": 1.0, "felt": 2.0, "duration": 0.3}
     sensor = dd.ForceSensor(1, tau)
-    times, error, *_ = run(model, HOLD, measured=True, gain=gain, sensor=sensor, **given)
+    times, error = run(model, HOLD, measured=True, gain=gain, sensor=sensor, **given)
     # RK5 at 1 ms, (1 + G) / tau = 20 1/s: about 1e-12.
     expected = -gain * 2.0 * np.exp(-(1 + gain) / tau * times)
     np.testing.assert_allclose(error[:, 1], expected, atol=1e-9)
@@ -249,15 +232,6 @@ def test_the_drift_of_a_sensor_is_set_in_a_context():
     np.testing.assert_allclose(measured, [12.5, 19.5], atol=1e-14)
 
 
-def test_sensor_has_no_direct_feedthrough_from_force():
-    for sensor in (
-        dd.ForceSensor(1, 0.01),
-        dd.ForceSensor(1, 0.0, 0.01),
-        dd.ForceSensor(1, 0.01, 0.01),
-    ):
-        assert not sensor.HasAnyDirectFeedthrough()
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -275,12 +249,7 @@ def test_what_no_sensor_can_be_is_refused(given, message):
 
 
 @pytest.mark.parametrize(
-    ("measured", "gain", "message"),
-    [
-        (True, -0.5, "force_gain"),
-        (False, 1.0, "measured_force"),
-        (True, np.eye(2), r"shape \(1, 1\)"),
-    ],
+    ("measured", "gain", "message"), [(True, -0.5, "force_gain"), (False, 1.0, "measured_force")]
 )
 def test_gains_of_forces_that_do_not_fit_are_refused(measured, gain, message):
     system = arm("two_link").model.dae

@@ -16,7 +16,6 @@ from drake_dae import (
     DaeSystem,
     Sampling,
     SinusoidReference,
-    StateEstimator,
     TrackingLaw,
     build_scenario,
     load_scenario,
@@ -27,7 +26,7 @@ from drake_dae import (
 )
 from drake_dae.dae import DerivativeLayout, Observation, Parameter, find_structure, with_disturbance
 from drake_dae.diagrams import LoopSettings
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.errors import ScenarioError
 from drake_dae.running import start_values
 from drake_dae.scenario.shipped import FOLDER
 from drake_dae.systems import Observing
@@ -320,13 +319,6 @@ def test_estimates_that_are_not_possible_are_refused(settings, message):
 def test_an_estimate_needs_an_observer():
     with pytest.raises(ScenarioError, match=r"estimator\.rate: "):
         build_scenario(load_scenario("two_link_wall", ["estimator.parameters=[link2.mass]"]))
-
-
-def test_bounds_are_needed_in_python_too():
-    dae = scenario_model(load_scenario("two_link_wall")).dae
-    law = TrackingLaw(with_disturbance(dae, ["joint1_w", "joint2_w"], ["link2.mass"]), poles(-4.0))
-    with pytest.raises(ModelError, match=r"link2\.mass"):
-        StateEstimator(law, Observing(20.0), T)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arms import arm, error_controlled, law, numbers, touching
+from arms import arm, error_controlled, numbers, touching
 from numpy.testing import assert_allclose
 
 import drake_dae as dd
@@ -25,7 +25,7 @@ def follow(model, tracking, duration, *, start=None, change=None, wanted=WANTED,
         plant.set_parameter(own, name, value)
     if start is not None:
         controller = loop.controller.GetMyMutableContextFromRoot(context)
-        loop.controller.set_integral(controller, start)
+        controller.SetContinuousState(start)
     dd.simulate(loop.diagram, context, duration, error_controlled(1e-9))
     return loop, loop.record(context)
 
@@ -81,34 +81,6 @@ def test_a_push_that_the_law_does_not_know_is_integrated_away():
     assert abs(ends[True][0]) < 1e-6 < 1e-3 < abs(ends[False][0])
 
 
-def controller_of():
-    found = arm("two_link")
-    tracking = dd.TrackingLaw(
-        found.model.dae, dd.poles(-4.0), structure=found.structure, integral=["tool.z"]
-    )
-    controller = dd.TrackingController(tracking)
-    context = controller.CreateDefaultContext()
-    state = found.structure.states[1]
-    controller.GetInputPort("estimated_state").FixValue(context, state)
-    z = controller.law.error_coordinates(state, np.zeros(4))[1]
-    controller.GetInputPort("reference").FixValue(context, [z - 0.1, 0.0, 0.0, 20.0])
-    return controller, context
-
-
-def rate(controller, context):
-    return controller.EvalTimeDerivatives(context).CopyToVector()
-
-
-def test_the_integral_stops_where_it_is_held():
-    """e = 0.1."""
-    controller, context = controller_of()
-    assert rate(controller, context) == pytest.approx([0.1])
-    controller.GetInputPort("hold").FixValue(context, [1.0])
-    assert rate(controller, context) == [0.0]
-    controller.GetInputPort("hold").FixValue(context, [0.0])
-    assert rate(controller, context) == pytest.approx([0.1])
-
-
 def test_what_makes_no_sense_is_refused():
     found = arm("two_link")
     system, known = found.model.dae, {"structure": found.structure}
@@ -116,11 +88,5 @@ def test_what_makes_no_sense_is_refused():
         dd.TrackingLaw(system, dd.poles(-4.0), integral=["wall.force"], **known)
     with pytest.raises(GainError, match=r"'tool\.z'"):
         dd.TrackingLaw(system, dd.poles(-4.0), integral=["tool.z", "tool.z"], **known)
-    with pytest.raises(GainError, match=r"integral: .*tool\.y"):
+    with pytest.raises(ModelError, match=r"integral: .*tool\.y"):
         dd.TrackingLaw(system, dd.poles(-4.0), integral=["tool.y"], **known)
-    controller = dd.TrackingController(law("two_link"))
-    with pytest.raises(ModelError, match="integral"):
-        controller.set_integral(controller.CreateDefaultContext(), [0.0])
-    controller, context = controller_of()
-    with pytest.raises(ModelError, match="integral"):
-        controller.set_integral(context, [0.0, 0.0])

@@ -204,13 +204,12 @@ def test_friction_is_cancelled_against_the_motion_that_is_wanted_when_the_contro
 
     r' = -5 mm/s turns by then, with r'' = 1 m/s^2, to 15 mm/s, at which friction is nearly full.
     """
-    _, dae = frictional(0.3)
+    _, dae = frictional(0.4)
     law = TrackingLaw(dae, poles(-4.0))
     observer = StateEstimator(law, Observing(5.0), T, control_delay=0.02)
     state = law.structure.states[0]
     state = np.array([*state[:2], 0.0, 0.0])
     context = observer.CreateDefaultContext()
-    observer.set_friction(context, 0.4)
     for name, value in (
         ("measured_state", state),
         ("control", np.zeros(2)),
@@ -233,7 +232,7 @@ def test_law_cancels_wanted_friction_whatever_velocity_it_has():
     So noise of a velocity near 0, where friction is steep, makes no torque. With poles at -1e-6 the
     law feeds no velocity back; what is left grows with its square.
     """
-    _, dae = frictional(0.3)
+    _, dae = frictional(0.4)
     law = TrackingLaw(dae, poles(-1e-6))
     observer = StateEstimator(law, Observing(5.0), T)
     reference, controls = np.array([0.3, 0.2, 0.0, 20.0]), []
@@ -243,7 +242,6 @@ def test_law_cancels_wanted_friction_whatever_velocity_it_has():
         rows = np.vstack([n.output_jacobian, n.constraint_jacobian])
         state = np.concatenate([rest, np.linalg.solve(rows, [speed, 0.0])])
         context = observer.CreateDefaultContext()
-        observer.set_friction(context, 0.4)
         for name, value in (
             ("measured_state", state),
             ("measured_force", [20.0]),
@@ -343,12 +341,6 @@ def test_what_cannot_be_observed_is_refused():
             wanted,
             LoopSettings(observer=Observing(5.0), sampling=Sampling(T)),
         )
-    observer = StateEstimator(law, Observing(5.0), T)
-    context = observer.CreateDefaultContext()
-    observer.set_friction(context, 0.4)
-    assert observer.GetOutputPort("friction").Eval(context) == 0.4
-    with pytest.raises(ModelError, match=r"1\.4"):
-        observer.set_friction(context, 1.4)
 
 
 def test_push_behind_a_spring_is_found_with_its_derivatives_and_cancelled():

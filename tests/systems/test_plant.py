@@ -13,8 +13,8 @@ from drake_dae import DaePlant, DaeSystem, RobotPlant, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SingularityError
 
 
-def two_link(project=True):
-    return RobotPlant(arm("two_link").model, structure=arm("two_link").structure, project=project)
+def two_link():
+    return RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
 
 
 def driven(plant, control):
@@ -136,11 +136,6 @@ def test_parameters_that_make_no_sense_are_refused():
         with pytest.raises(ModelError, match=message):
             plant.set_parameter(context, "link2.mass", value)
     assert plant.get_parameter(context, "link2.mass") == 6.0
-
-
-def test_what_is_no_system_is_refused():
-    with pytest.raises(ModelError, match=r"system.*None"):
-        DaePlant(None)
 
 
 def test_the_structure_of_another_system_is_refused():

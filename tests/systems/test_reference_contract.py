@@ -117,17 +117,15 @@ def rule_6_traced_together_the_values_are_the_same(reference):
     """Beside another, all as one function or one after the other; and as an expression."""
     degrees = [2] * reference.size
     time = ca.SX.sym("t")
-    rows = reference.expression(degrees, time)
-    traced = None if rows is None else ca.Function("rows", [time], [rows])
+    traced = ca.Function("rows", [time], [reference.expression(degrees, time)])
     generator = dd.ReferenceGenerator([dd.ConstantReference(7.0), reference], [1, *degrees])
     for moment in TIMES:
         stacked = generator.reference(moment)
         np.testing.assert_array_equal(stacked[:2], [7.0, 0.0])
         own = reference.derivatives(degrees)(moment)
         np.testing.assert_allclose(stacked[2:], own, rtol=1e-14, atol=1e-14)
-        if traced is not None:
-            # Derivatives of a polynomial of a short piece are divided by its length.
-            np.testing.assert_allclose(traced(moment).full()[:, 0], own, rtol=1e-12, atol=1e-12)
+        # Derivatives of a polynomial of a short piece are divided by its length.
+        np.testing.assert_allclose(traced(moment).full()[:, 0], own, rtol=1e-12, atol=1e-12)
 
 
 RULES = (

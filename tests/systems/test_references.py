@@ -163,8 +163,3 @@ def test_what_is_no_reference_is_refused():
     message = r"references\[1\].*0\.5"
     with pytest.raises(ReferenceSignalError, match=message):
         dd.ReferenceGenerator([dd.ConstantReference(0.3), 0.5], [0, 0])
-
-
-def test_symbols_besides_the_time_are_refused():
-    with pytest.raises(ReferenceSignalError, match=r"\bb\b"):
-        dd.ExpressionReference(lambda t: t + ca.SX.sym("b"))

@@ -141,33 +141,6 @@ def test_integrals_stand_still_while_a_drive_is_at_its_limit():
     assert_allclose(record["integral"], 0.0)
 
 
-@pytest.mark.parametrize(
-    ("gain", "sensor", "sampling"),
-    [
-        (1.1, None, dd.Sampling(0.01)),
-        (1.1, None, dd.Sampling(0.01, 0.02)),
-        (2.0, (0.01, 0.0), dd.Sampling(0.01, 0.02)),
-    ],
-)
-def test_sampled_force_loop_that_diverges_is_refused(gain, sensor, sampling):
-    found = arm("two_link")
-    tracking = dd.TrackingLaw(
-        found.model.dae,
-        dd.poles(-4.0),
-        structure=found.structure,
-        measured_force=True,
-        force_gain=gain,
-    )
-    wanted = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
-    with pytest.raises(WiringError, match="force_gain"):
-        dd.make_closed_loop(
-            dd.RobotPlant(found.model, structure=found.structure),
-            tracking,
-            wanted,
-            LoopSettings(sensor=sensor and dd.ForceSensor(1, *sensor), sampling=sampling),
-        )
-
-
 def test_a_law_that_reads_the_force_of_its_own_first_control_is_reported():
     """A sensor that samples has a force at the start."""
     arms = arm("two_link")

@@ -266,10 +266,9 @@ def all_rows(mechanism: Mechanism, bodies: dict[str, Frame], q: Array) -> list[R
 
 
 def closed(mechanism: Mechanism, q: Array) -> Array:
-    """Positions at which all closures hold, by Newton's method; those that are placed stay."""
+    """Positions at which all closures hold, by Newton's method; the free ones stay."""
     q, size = q.copy(), mechanism.size
-    placed = mechanism.free if mechanism.placed is None else mechanism.placed
-    solved = [i for i in range(size) if i not in placed]
+    solved = [i for i in range(size) if i not in mechanism.free]
     for _ in range(60):
         rows = all_rows(mechanism, frames(mechanism, q, zeros(size)), q)
         rows = [row for row in rows if row.gap is not None]

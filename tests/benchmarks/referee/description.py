@@ -84,10 +84,8 @@ class Mechanism:
 
     Each body stands after its parent. Of `q` the positions of `free` joints are exact, the others
     guesses from which Newton's method starts; `v` has the rates of free joints that are not zero.
-    The rates of the free joints determine all rates; those `placed` determine all positions, and
-    are more than the free ones if the constraint is nonholonomic. `torques` act in joints. If
-    forces are redundant, `split` says how they are split. After `duration`, if it is not zero, the
-    forces are compared again.
+    The free joints determine all others. `torques` act in joints. If forces are redundant, `split`
+    says how they are split. After `duration`, if it is not zero, the forces are compared again.
     """
 
     name: str
@@ -96,7 +94,6 @@ class Mechanism:
     q: tuple[float, ...]
     free: tuple[int, ...]
     v: Mapping[int, float] = field(default_factory=dict)
-    placed: tuple[int, ...] | None = None
     gravity: Vector = (0.0, 0.0, -9.81)
     torques: Mapping[int, float] = field(default_factory=dict)
     springs: tuple[Spring, ...] = ()

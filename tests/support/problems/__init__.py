@@ -4,6 +4,8 @@ Every problem is worked out by hand: degrees, A, alpha, beta, a and B are writte
 derivation in its docstring, and share no code with the library.
 """
 
+# ruff: noqa: F401
+
 from collections.abc import Callable
 from functools import cache
 
@@ -34,35 +36,6 @@ from problems.mechanisms import (
 )
 from problems.nonholonomic import knife_edge, knife_edge_force
 from problems.problem import Array, Known, Problem, known, unconstrained
-
-__all__ = [
-    "PROBLEMS",
-    "Array",
-    "Hidden",
-    "Known",
-    "Problem",
-    "bead",
-    "changed",
-    "closed_loop_outputs",
-    "double_integrator",
-    "early_control",
-    "hanging_pendulum",
-    "hidden_normal_form",
-    "in_other_units",
-    "integrated",
-    "knife_edge",
-    "known",
-    "linear",
-    "pendulum",
-    "pendulum_known",
-    "pendulum_tension",
-    "pushed_mass",
-    "redundant",
-    "reference_at",
-    "system_of",
-    "unconstrained",
-    "wanted_outputs",
-]
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     function.__name__: cache(function)

@@ -66,7 +66,6 @@ def linear() -> Problem:
         reference=[(0.0, 0.0, 1.0), (0.5, 0.0, 1.0)],
         derivatives=lambda state: k @ state,
         horizon=0.5,  # One of its zeros is -134 1/s: SciPy takes small steps.
-        source="Krishnan and McClamroch 1992; by matrices: Dai, Singular Control Systems, 1989",
     )
 
 

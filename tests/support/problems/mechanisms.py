@@ -59,7 +59,6 @@ def pendulum() -> Problem:
         consistent=_pendulum_state,
         reference=[(0.45, 0.0, 0.1)],
         derivatives=_pendulum_derivatives,
-        source="Hairer and Wanner, Solving Ordinary Differential Equations II, 1996, VII.1",
     )
 
 
@@ -77,7 +76,6 @@ def pendulum_tension() -> Problem:
         reference=[(-25.0, 0.0, 1.0)],
         derivatives=_pendulum_derivatives,
         horizon=0.1,  # Later it comes to x = 0, where u does not act on the tension.
-        source="Hairer and Wanner, Solving Ordinary Differential Equations II, 1996, VII.1",
     )
 
 
@@ -143,7 +141,7 @@ def _arm_derivatives(x: Array) -> Array:
 
 
 def two_link_arm() -> Problem:
-    """A two-link arm whose tip slides on a wall (section 3.1 of the paper), z = (force, height).
+    """A two-link arm whose tip slides on a wall (McClamroch and Wang 1988), z = (force, height).
 
     (37)-(38) with phi = WALL - x_tip: A = J M^-1 J', alpha = -A^-1 (-J M^-1 H + Jdot qd),
     beta = -A^-1 J M^-1. The force comes first, so (15) must permute; 0 < s = 1 < p.
@@ -176,7 +174,6 @@ def two_link_arm() -> Problem:
         consistent=_arm_state,
         reference=[(20.0, 0.0, 5.0), (0.5, 0.0, 0.1)],
         derivatives=_arm_derivatives,
-        source="McClamroch and Wang, IEEE Transactions on Automatic Control 33(5), 1988: r = 2",
     )
 
 
@@ -233,7 +230,7 @@ def gantry() -> Problem:
 
 
 def aircraft() -> Problem:
-    """A planar vertical takeoff aircraft whose roll jets also push sideways: e = 0.5.
+    """A planar aircraft whose roll jets also push sideways (Hauser et al. 1992): e = 0.5.
 
     x'' = -s u1 + e c u2, y'' = c u1 + e s u2 - 1, roll'' = u2: mu = (2, 2), det B = -e. With z at
     rest e roll'' = sin roll is left, an inverted pendulum.
@@ -267,7 +264,6 @@ def aircraft() -> Problem:
         consistent=lambda random: random.uniform(-0.3, 0.3, 6),
         reference=[(0.0, 0.0, 0.2), (0.0, 0.0, 0.2)],
         horizon=1.0,  # Its zero dynamics are not stable.
-        source="Hauser, Sastry and Meyer, Automatica 28(4), 1992",
     )
 
 

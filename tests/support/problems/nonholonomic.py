@@ -73,7 +73,6 @@ def knife_edge() -> Problem:
         consistent=_sleigh_state,
         reference=[(0.5, 0.0, 0.5), (1.0, 0.0, 0.3)],
         derivatives=_sleigh_derivatives,
-        source="Bloch, Nonholonomic Mechanics and Control, 2003, chapter 1: the knife edge",
     )
 
 

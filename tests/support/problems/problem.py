@@ -37,7 +37,6 @@ class Problem:
         reference: Per output start, slope and amplitude of a signal that can be followed.
         derivatives: x -> k and its derivatives, constraint-major, shape (sum r_i,).
         horizon: How long it can be followed, in s.
-        source: Where degrees or index are published; "" if made up for the tests.
     """
 
     system: DaeSystem
@@ -51,7 +50,6 @@ class Problem:
     reference: Sequence[tuple[float, float, float]]
     derivatives: Callable[[Array], Array] = field(default=lambda x: np.zeros(0))
     horizon: float = 1.5
-    source: str = ""
 
     @cached_property
     def structure(self) -> Structure:
