@@ -282,20 +282,6 @@ def test_a_bias_is_found_before_the_touch(observed, told):
 
 
 @pytest.mark.slow
-def test_a_contact_that_is_lost_after_the_last_phase(observed, told):
-    """A push pulls with 40 N where the arm rests with 10 N; the law in contact would go on."""
-    push = "plant.disturbances=[{frame: tool, force: [-40, 0, 0], start_time: 0.8, end_time: 3}]"
-    only = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
-    settings = [push, only, "estimator=null", "task.patience=0.02", "duration=1.6"]
-    *_, text, found = told(observed, *settings, "plant.friction=0")
-    assert "held, the contact is lost at rest" in " ".join(text.split("; "))
-    assert found["constraint_force"][found.time < 0.8][-1] > 5.0
-    assert found["phase"][found.time < 0.8][-1, 2] == 1.0  # It is done.
-    assert np.all(found["constraint_force"][found.time > 1.0] == 0.0)
-    assert np.max(np.abs(found["state"][-1, 2:])) < 0.05
-
-
-@pytest.mark.slow
 def test_gains_of_a_task_are_advised(observed, told):
     """With friction of 0.3 in Drake's contact: 0.02 mm and 0.05 N were asked, 3.6 mm and 3.2 N
     were."""
