@@ -181,8 +181,8 @@ def _sensed_gains(
         bare = ". A contact that is stiffer than stated may be unstable: sample more often"
     return best, (
         ". These gains are the best for one direction alone, "
-        f"{1e3 * best.noise_error:.2g} mm and {best.noise_force:.2g} N rms by noise, and a change "
-        f"of the controls of {best.roughness:.2g} N m from sample to sample{bare}"
+        f"{1e3 * best.free.by_noise:.2g} mm and {best.contact.by_noise:.2g} N rms by noise, and a "
+        f"change of the controls of {best.roughness:.2g} N m from sample to sample{bare}"
     )
 
 

@@ -176,8 +176,8 @@ def test_the_stated_errors_are_those_of_the_linear_model_and_the_bias_of_the_sen
     efforts = model.control_limits[np.isfinite(model.control_limits)]
     best = advised_gains(sensed_contact(found, model, structure, 1e5), 3e-3 * efforts.max())
     position, force = stated_errors(advised(found, model, structure).scenario, model, structure)
-    assert position == pytest.approx(best.position_error, rel=0.01)
-    assert force == pytest.approx(np.hypot(best.force_error, 0.7), rel=0.01)
+    assert position == pytest.approx(best.free.error, rel=0.01)
+    assert force == pytest.approx(np.hypot(best.contact.error, 0.7), rel=0.01)
 
 
 @pytest.mark.slow
