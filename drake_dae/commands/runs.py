@@ -1,13 +1,9 @@
 """`drake-dae simulate`, `plot` and `play`: runs, and pictures of the folders that they leave."""
 
 import argparse
-import os
 import shlex
 import sys
 import time
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -21,7 +17,7 @@ import drake_dae
 from drake_dae.commands.writing import check_folder, complete, open_page, program, waiting
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter, Recorded
-from drake_dae.errors import ModelError, ScenarioError, describe_os_error
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.files import check_unwritten
 from drake_dae.pictures import ANIMATION, PLOTS
 from drake_dae.pictures.animation import make_animation
@@ -112,56 +108,42 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
     # Its files. A signal from here on takes effect between the record and the pictures.
     record, wanted = recorded(None), scenario.write
-    problems, results = list[str](), dict[str, Any]()
-
-    @contextmanager
-    def attempt(name: str) -> Iterator[Path]:
-        """Other files are written also if this one cannot be."""
-        try:
-            with complete(folder, name) as place:
-                yield place / name
-        except OSError as error:
-            problems.append(describe_os_error(error))
-
+    results = dict[str, Any]()
     if record.time.size:
-        with ending_signals(ending := Interruption()):
-            summary = judge_run(scenario, loop, context, record, statistics, reason)
-            if wanted.record:
-                outputs = record.signals["tracking_error"].signals
-                predicted = Recorded(loop.predicted_error(record), outputs)
-                signals = {**record.signals, "predicted_error": predicted}
-                with attempt(RECORD) as file:
-                    about = {"scenario": scenario_data(scenario)}
-                    replace(record, signals=signals, about=about).save(file)
-            with attempt(SUMMARY) as file:
-                file.write_text("\n".join([summary.text, *notes, ""]), encoding="utf-8")
+        summary = judge_run(scenario, loop, context, record, statistics, reason)
         try:
+            with ending_signals(ending := Interruption()):
+                if wanted.record:
+                    outputs = record.signals["tracking_error"].signals
+                    predicted = Recorded(loop.predicted_error(record), outputs)
+                    signals = {**record.signals, "predicted_error": predicted}
+                    about = {"scenario": scenario_data(scenario)}
+                    with complete(folder, RECORD) as place:
+                        replace(record, signals=signals, about=about).save(place / RECORD)
+                with complete(folder, SUMMARY) as place:
+                    text = "\n".join([summary.text, *notes, ""])
+                    (place / SUMMARY).write_text(text, encoding="utf-8")
             if ending.signal is not None:
                 end_at_once(ending.signal)
             with waiting("drawing"):
                 if wanted.plots and not isinstance(ended, KeyboardInterrupt):
                     from drake_dae.pictures.plots import save_plots  # Matplotlib takes a second.
 
-                    with attempt(PLOTS[0]) as file:
-                        save_plots(loop, record, context, file.parent)
+                    with complete(folder, PLOTS[0]) as place:
+                        save_plots(loop, record, context, place)
                 if wanted.animation and not isinstance(ended, KeyboardInterrupt):
                     title = f"{path.stem}: {scenario.description}".removesuffix(": ")
-                    with attempt(ANIMATION) as file:
+                    with complete(folder, ANIMATION) as place:
                         page = make_animation(loop, record, context, title)
-                        file.write_text(page, encoding="utf-8")
+                        (place / ANIMATION).write_text(page, encoding="utf-8")
         finally:
             written = [name for name in FILES if (folder / name).exists()]
             results = {**summary.data, "files": written}
-            text, word = summary.text, summary.outcome.name
-            if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
-                color = {"GOOD": 32, "BAD": 31, "UNDECIDED": 33}[word]
-                text = f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
-            print(f"{text}\nwritten to {folder}/: {', '.join(written)}", flush=True)
+            print(f"{summary.text}\nwritten to {folder}/: {', '.join(written)}", flush=True)
             if ANIMATION in written:
                 named = shlex.quote(str(folder))
                 plots = "" if wanted.plots else f"; plots: {program()} plot {named} --all"
                 print(f"watch it: {program()} play {named}{plots}", flush=True)
-            print(*(f"error: {line}\n" for line in problems), sep="", end="", file=sys.stderr)
 
     # How it ended.
     if ended is not None:
@@ -172,18 +154,14 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         open_page(folder / ANIMATION)
     assert statistics is not None
     cut = 128 + statistics.interrupted if statistics.interrupted else 0
-    code = 1 if problems else 2 if options.check and results.get("missed") else 0
+    code = 2 if options.check and results.get("missed") else 0
     return cut or code, {"scenario": path.stem, "folder": str(folder), **results}
 
 
 def _new_folder(name: str) -> Path:
-    """Makes a folder below runs/ that no other run has."""
-    for i in count(1):
-        folder = Path("runs", name if i == 1 else f"{name}-{i}")
-        with suppress(FileExistsError):
-            folder.mkdir(parents=True)
-            break
-    return folder
+    """A folder below runs/ that no other run has."""
+    folders = (Path("runs", name if i == 1 else f"{name}-{i}") for i in count(1))
+    return next(folder for folder in folders if not folder.exists())
 
 
 def plot_command(options: argparse.Namespace) -> int:
@@ -216,10 +194,8 @@ def plot_command(options: argparse.Namespace) -> int:
     with waiting(f"drawing {path.name}"):
         if is_film:
             draw = partial(save_film, *_run_again(runs[0]))
-        else:  # The whole path is the label where the last part is ambiguous.
-            same = Counter(run.name for run in runs)
-            labels = [run.name if run.name and same[run.name] == 1 else str(run) for run in runs]
-            records = dict(zip(labels, map(_load_record, runs), strict=True))
+        else:
+            records = {str(run): _load_record(run) for run in runs}
             names = [name for text in options.signals for name in text.split(",") if name]
             draw = partial(plot_runs(records, names, options.errors).savefig, dpi=110)
         with complete(path.parent, path.name) as place:
@@ -250,9 +226,7 @@ def play_command(options: argparse.Namespace) -> int:
     """Opens the animation of a run in the browser."""
     folder, page = options.folder, options.folder / ANIMATION
     if not (folder / SCENARIO).is_file():
-        runs = sorted(str(path.parent) for path in folder.parent.glob(f"*/{ANIMATION}"))
-        there = f"; there is {', '.join(runs)}" if runs else ""
-        raise ModelError(f"'{folder}' is no folder of a run{there}")
+        raise ModelError(f"'{folder}' is no folder of a run")
     if not page.is_file():
         raise ModelError(
             f"'{folder}' has no {ANIMATION}: a run writes it at its end, unless write.animation is "

@@ -58,12 +58,8 @@ def open_page(page: Path) -> None:
 
 def program() -> str:
     """The words before a command that is printed for the user, so that it works as printed."""
-    script = Path(sys.argv[0])
-    if script.name != "drake-dae":
-        return shlex.join([sys.executable, "-m", "drake_dae"])
-    found = shutil.which(script.name)
-    is_on_path = found is not None and script.exists() and Path(found).samefile(script)
-    return script.name if is_on_path else shlex.quote(str(script.absolute()))
+    words = ["drake-dae"] if shutil.which("drake-dae") else [sys.executable, "-m", "drake_dae"]
+    return shlex.join(words)
 
 
 @contextmanager

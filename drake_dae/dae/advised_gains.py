@@ -19,15 +19,16 @@ _PHASE = 0.3
 it with an estimator: a force along the contact that it attributes to friction couples the contact
 to free directions, and with the full phase an unknown mass of 1 kg made them swing."""
 
-MASSES = (0.5, 1.0, 2.0)
-"""Free directions are stable if a force accelerates by these factors more than in the model."""
-
-CONTACT_MASSES = (2.0 / 3.0, 1.0, 1.5)
-STIFFNESSES = (1e-3, 0.1, 0.5, 1.0, 2.0)
-"""The same along a contact, each with these stiffnesses relative to the stated one."""
-
 DECAY = 0.05
-"""The least rate at which these loops settle, relative to w, with half of the stiffness or more."""
+"""The least rate at which loops settle, relative to w, with half of the stiffness or more."""
+
+FREE_CASES = [(mass, 1.0, DECAY) for mass in (0.5, 1.0, 2.0)]
+CONTACT_CASES = [
+    (mass, share, DECAY if share >= 0.5 else 0.0)
+    for mass, share in product((2.0 / 3.0, 1.0, 1.5), (1e-3, 0.1, 0.5, 1.0, 2.0))
+]
+"""In free directions and along a contact: what a force accelerates, relative to the model; the
+stiffness, relative to the stated one; and the least rate."""
 
 SLOWER = (1.0, 0.5, 0.25)
 """The factors by which the integral and the observer along a contact are slowed, since both reduce
@@ -99,7 +100,13 @@ class SensedContact:
 
 @dataclass(frozen=True)
 class Part:
-    """The prediction for one direction: the error, its part by noise, and the roughness in N m."""
+    """The prediction for one direction.
+
+    The error is the rms one of a point in m, or of the contact force in N: by noise, by an unknown
+    force of `MODEL_ERROR` that appears every `EVERY` seconds and, of the force, by a reference that
+    changes by `RAMP`, in squares; `by_noise` is the part by noise. The roughness is the rms change
+    of the controls from sample to sample in N m.
+    """
 
     rate: float
     rates: DirectionGains
@@ -127,16 +134,10 @@ class Part:
 
 def is_stable(situation: SensedContact, part: Part) -> bool:
     """Whether a loop settles for all masses and stiffnesses for which it must be stable."""
-    cases = [(mass, 1.0, DECAY) for mass in MASSES]
-    if part.is_contact:
-        cases = [
-            (mass, share, DECAY if share >= 0.5 else 0.0)
-            for mass, share in product(CONTACT_MASSES, STIFFNESSES)
-        ]
     return all(
         situation.loop(part.rates, part.is_contact, mass, share).radius
         < 1.0 - decay * part.rate * situation.period
-        for mass, share, decay in cases
+        for mass, share, decay in (CONTACT_CASES if part.is_contact else FREE_CASES)
     )
 
 
@@ -167,18 +168,13 @@ def _groups(situation: SensedContact, fast: float | None, contact: bool) -> Iter
 class AdvisedGains:
     """Gains with the rate of the estimator in 1/s, if there is one, and what is predicted for them.
 
-    The errors are the rms ones of a point in m and of the contact force in N: by noise, by an
-    unknown force of `MODEL_ERROR` that appears every `EVERY` seconds and, of the force, by a
-    reference that changes by `RAMP`, in squares; `noise_error` and `noise_force` are their parts by
-    noise. The roughness is the rms change of the controls from sample to sample in N m.
+    The roughness is that of both directions, in N m.
     """
 
     gains: ContactGains
     state_rate: float | None
-    position_error: float
-    force_error: float
-    noise_error: float
-    noise_force: float
+    free: Part
+    contact: Part
     roughness: float
 
 
@@ -247,10 +243,8 @@ def advised_gains(
             position_damping=(own.gains[2] / p - 1.0) / 2.0,
         ),
         state_rate=fast,
-        position_error=free.error,
-        force_error=contact.error,
-        noise_error=free.by_noise,
-        noise_force=contact.by_noise,
+        free=free,
+        contact=contact,
         roughness=_roughness((free, contact)),
     )
 

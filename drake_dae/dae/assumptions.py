@@ -64,10 +64,8 @@ class ViolationKind(Enum):
     )
     SINGULAR_CONFIGURATION = (
         _LOSES_RANK,
-        "This is a singular configuration: forces are not determined there, and motions on N* may "
-        "branch. A plant that starts elsewhere passes through it if its velocity leads across; a "
-        "law cannot. Choose a nominal state and motions that keep away, or give one of the "
-        "constraints a spring or a clearance",
+        "This is a singular configuration: forces are not determined there. Choose a nominal state "
+        "and motions that keep away, or give one of the constraints a spring or a clearance",
     )
     HIDDEN_DEGREE = (
         _LOSES_RANK,
@@ -77,9 +75,8 @@ class ViolationKind(Enum):
     NUMBERS = (
         "the relative degree of {what} depends on numbers: {acts} on its derivative {order} "
         "{deciding}",
-        "The structure must be the same for all values of parameters and signals. Give such a "
-        "parameter or signal another default, or give its range, by `DaeSystem.with_bounds` or "
-        "`bounds` of a scenario; equal bounds fix it at its default",
+        "Give such a parameter or signal another default, or give its range, by "
+        "`DaeSystem.with_bounds` or `bounds` of a scenario; equal bounds fix it at its default",
     )
     BOUNDS = (
         "{matrix} loses rank within the bounds, {deciding}",

@@ -50,9 +50,8 @@ class Contacts:
         self.frictions = [by_name[c.friction] if c.friction else None for c in chosen]
         if len(self.rows) > MOST:
             raise ModelError(
-                f"{owner}: {len(self.rows)} unilateral forces, one of them with friction; "
-                f"with friction at most {MOST} are possible, since all their subsets are "
-                "examined. Remove the friction, or some contacts"
+                f"{owner}: with friction at most {MOST} unilateral forces are possible, got "
+                f"{len(self.rows)}. Remove the friction, or some contacts"
             )
 
     def __bool__(self) -> bool:

@@ -147,10 +147,10 @@ class Derivatives:
         """Returns the control for which an expression of the motion has desired values.
 
         The equations of the motion and `expression = desired` are solved together for the control
-        and for the unknowns that it moves, block by block along their structure (Dulmage and
-        Mendelsohn 1958). So B(x) of (16) is not formed, and with rigid joints no inverse of M(q):
-        it is inverse dynamics. Also returns a scalar that is 0 exactly where the control is not
-        determined, and what is shown; None if the equations are not linear in what it moves.
+        and the unknowns that it moves, block by block along their structure (Dulmage and Mendelsohn
+        1958): B(x) of (16) is not formed, with rigid joints it is inverse dynamics. Also returns a
+        scalar that is 0 exactly where the control is not determined, and what is shown; None if the
+        equations are not linear in what it moves.
         """
         shown = ca.SX(0, 1) if shown is None else shown
         orders = self.orders_in(ca.vertcat(expression, shown))

@@ -1,16 +1,14 @@
 """Dynamic extension: integrators before controls, where B(x) has no inverse without them.
 
 If B(x) of (16) is singular, one combination of the controls acts on some outputs before the others
-do: the drive of a wheeled robot acts on both coordinates of its position before its steering does.
-If that combination becomes a state and its derivative the control, all controls act at the same
-order. The law (28) of the extended system is then a dynamic state feedback of the original one.
+do, as the drive of a wheeled robot before its steering. If that combination becomes a state and its
+derivative the control, all controls act at the same order. The law (28) of the extended system is
+then a dynamic state feedback of the original one.
 
-Descusse and Moog, "Decoupling with dynamic compensation for strong invertible affine non-linear
-systems", International Journal of Control 42(6), 1985; Isidori, Nonlinear Control Systems, 1995,
-section 5.4; Nijmeijer and van der Schaft, Nonlinear Dynamical Control Systems, 1990, chapter 8.
+Descusse and Moog, International Journal of Control 42(6), 1985; Isidori, Nonlinear Control Systems,
+1995, section 5.4.
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -39,10 +37,9 @@ class Extension:
     """A system with integrators before its controls, whose B(x) is regular.
 
     The original system's control is u = offset(x_e) + matrix(x_e) w, with x_e and w the state and
-    the control of the extended one, whose first n states are those of the original: with the
-    integrators it is a dynamic state feedback. `integrators` is the number before each of the
-    original controls. If others are mixed in first, the new state has a star: "u1*" is
-    u1 + sum_j b_j(x) u_j.
+    the control of the extended one, whose first n states are those of the original. `integrators`
+    is the number before each of the original controls. If others are mixed in first, the new state
+    has a star: "u1*" is u1 + sum_j b_j(x) u_j.
     """
 
     original: DaeSystem
@@ -80,19 +77,16 @@ def dynamic_extension(
     In each round the controls that act in the dependent rows of B(x) get an integrator. If more
     than q controls act in rows of rank q, a regular static feedback u = beta(x) w is applied first,
     after which only q controls act in them; see `Extension.integrators`. Each round reduces the
-    dimension of the zero dynamics by the rank deficiency of B(x), so that it ends after few rounds:
-    if no zero dynamics remain and B(x) is still singular, the outputs are dependent and there is no
-    extension.
+    dimension of the zero dynamics by the rank deficiency of B(x), so that it ends after few rounds.
+
+    The system stays as it is if its B(x) is regular.
 
     Args:
         system: The system (1)-(3).
         nominal_control: Values of the controls at the nominal state, for the integrators that hold
             them; zero where not given.
-        spread: The standard deviation of the random states, as in `find_structure`. That of a
-            control is 0.1 of its nominal value; 0.1 if that is zero.
-
-    Returns:
-        The extended system; the original one if its B(x) is regular.
+        spread: The standard deviation of the random states, as in `find_structure`; of a control
+            0.1 of its nominal value, or 0.1.
 
     Raises:
         AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
@@ -119,8 +113,7 @@ def dynamic_extension(
         near = replace(
             extended, nominal_state=extended.nominal_state + step, state_scale=extended.scale
         )
-        structure, _ = examine_structure(near, spread=spreads)
-        choice = _controls_to_integrate(structure)
+        choice = _controls_to_integrate(examine_structure(near, spread=spreads))
         if choice is None:
             break
         columns, mixing = choice
@@ -148,11 +141,10 @@ def dynamic_extension(
         held[columns] = 0.0
         # B(x) is often singular at zero, so a nonzero value is kept away from zero.
         spreads = np.concatenate([spreads, 0.1 * positive(np.abs(nominal))])
-        so_far = ", ".join(f"{count} before {name}" for name, count in integrators.items())
         if sum(integrators.values()) > system.num_states:
             raise AssumptionError(
                 f"more than {system.num_states} integrators are needed for a regular B(x) of "
-                f"(16), so far {so_far}. Choose other outputs",
+                f"(16), so far {_listed(integrators)}. Choose other outputs",
                 5,
             )
     try:
@@ -160,18 +152,18 @@ def dynamic_extension(
     except AssumptionError as error:
         if error.state is None:
             raise
-        remedy, entries = "Keep away from this state", {name: 1.0 for name in integrators}
-        if integrators:
-            example = json.dumps(entries)
-            remedy += f", or give another nominal_control, for example nominal_control={example}; "
-            remedy += f"integrators: {so_far}"
         raise AssumptionError(
-            f"B(x) of (16) is regular around x = {show(error.state)}, but not there: it is "
-            f"singular at isolated states, which more integrators do not change. {remedy}",
+            f"B(x) of (16) is regular around x = {show(error.state)}, but not there, which "
+            "more integrators do not change. Keep away from this state, or give the controls that "
+            f"are integrated another nominal_control; integrators: {_listed(integrators)}",
             error.assumption,
             error.state,
         ) from error
     return Extension(system, extended, structure, integrators, offset, matrix)
+
+
+def _listed(integrators: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} before {name}" for name, count in integrators.items()) or "none"
 
 
 def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | None] | None:
@@ -193,8 +185,7 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     rank, p = int(ranks.max()), system.num_controls
     if rank == p:
         return None
-    least = system.least_margin
-    rows = [i for i in range(p) if any(np.abs(u[i, rank:]).max() > least for u in left)]
+    rows = np.flatnonzero(np.abs(left[:, :, rank:]).max(axis=(0, 2)) > system.least_margin).tolist()
     if ranks.min() < rank:
         state = samples.states[int(ranks.argmin())]
         raise AssumptionError(
@@ -226,12 +217,8 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     # exact: every column lies in the span of the chosen ones.
     part = structure.control_matrix[rows, :] / row_size[rows]
     chosen = part[:, columns]
-    mixing = ca.SX(q, p - q)
-    mixed = [i for i, j in enumerate(others) if j in acting]
-    mixing[:, mixed] = Factorization(ca.mtimes(chosen.T, chosen)).solve(
-        ca.mtimes(chosen.T, part[:, [others[i] for i in mixed]])
-    )
-    return columns, mixing
+    mixing = Factorization(ca.mtimes(chosen.T, chosen)).solve(ca.mtimes(chosen.T, part[:, others]))
+    return columns, ca.sparsify(mixing)
 
 
 def _integrated(

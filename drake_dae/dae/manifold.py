@@ -215,8 +215,7 @@ class Manifold:
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
         """Whether the residual is large, or not finite, though Newton's step may be short.
 
-        Near a pole the step is the distance to it. At a pole the residual may be 0 by round-off;
-        it is large next to it, and falls with the distance, while it grows from a consistent state.
+        At a pole it may be 0 by round-off; next to it, it is large and falls with the distance.
         """
         away = self.scale * np.random.default_rng(0).normal(size=x.size)
         left, near, far = (

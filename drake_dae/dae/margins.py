@@ -47,8 +47,8 @@ def find_margin(
 ) -> RankMargin:
     """Finds the smallest singular values of a matrix at sampled states and between them.
 
-    If the determinant of a square matrix changes its sign on the way from the first state, it is
-    zero on that way, unless N* is not connected or the determinant is infinite.
+    Between them: where the determinant of a square matrix changes its sign on the way from the
+    first state; and with `search` downhill from the worst states.
     """
     system, whole = samples.system, ca.SX(matrix)
     for i, j in np.argwhere(round_off) if round_off is not None else ():

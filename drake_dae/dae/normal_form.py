@@ -136,9 +136,8 @@ class NormalForm:
     ) -> FloatArray:
         """Returns x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
 
-        The inverse is local: other states may have the same coordinates (elbow up, elbow down). The
-        one that continues the guess is found by damped Newton's method or, if that fails, by
-        continuation along the straight line from the coordinates of the guess to the given ones.
+        Of several such states (elbow up, elbow down) the one is found that continues the guess: by
+        Newton's method, or along the line from its coordinates to the given ones.
 
         Raises:
             InconsistentStateError: There is no such state, or it is not reached from the guess;
@@ -276,7 +275,7 @@ def linearize(
 ) -> Linearization:
     """Linearizes a plant from its control u to its controlled outputs z.
 
-    Exogenous signals are at rest at their parameters' values, unless `parameters` say otherwise.
+    Exogenous signals are at rest, unless `parameters` say otherwise.
 
     Args:
         system: The system (1)-(3).

@@ -107,7 +107,7 @@ class PinnedOutputs:
     def at_time(
         self, reference: TimeFunction, parameters: TimeFunction, time: float
     ) -> "PinnedSet":
-        """Returns Z(R(t)); raises NonFiniteError where R(t) is not finite."""
+        """Returns Z(R(t))."""
         value = result_of("reference", reference, time)
         goal = numbers(f"reference({time:g})", value).reshape(-1)
         if goal.size != self.layout.reference_size:
@@ -135,10 +135,10 @@ class PinnedOutputs:
     def least_margins(self) -> FloatArray:
         """The margins below which A and B are singular, by their largest at sampled states."""
         still, p = np.zeros(self.layout.reference_size), self.system.parameter_values
-        margins = []
-        for x in self.structure.states:
-            A, B = map(as_matrix, self.motion.evaluate(x, still, p)[4:6])
-            margins.append([smallest_singular_value(A), smallest_singular_value(B)])
+        margins = [
+            [smallest_singular_value(as_matrix(M)) for M in self.motion.evaluate(x, still, p)[4:6]]
+            for x in self.structure.states
+        ]
         return VANISHED * np.max(margins, axis=0)
 
 
@@ -236,9 +236,9 @@ class EndCause(Enum):
     SINGULAR_START = "A(x) or B(x) is singular, or the domain of the system ends, at the start,"
     REFERENCE_NOT_FINITE = "the reference is not finite"
     UNBOUNDED = "the internal states grow without bound while the outputs follow,"
-    TOO_FAST = f"the motion is too fast to be followed in {MOST_STEPS} steps further than"
     NO_WAY_ON = (
-        "the reference jumps, or the domain of the system ends: no state continues the motion"
+        "the reference jumps, the domain of the system ends, or the motion is too fast: no state "
+        "continues the motion"
     )
     OUT_OF_REACH = "the reference leaves what the system can reach"
     SINGULAR = "the control would be unbounded; lead the reference around its course"
@@ -279,7 +279,7 @@ def follow(
     guess: FloatArray,
     parameters: TimeFunction,
 ) -> PinnedMotion:
-    """Computes the motion on Z(R(t)) from a state close to a guess; see `ZeroDynamics.motion`."""
+    """Computes the motion on Z(R(t)); see `ZeroDynamics.motion`."""
     system, points, ending = pinned.system, list[PinnedPoint](), None
     try:
         with np.errstate(all="ignore"):  # States outside the domain are tried and rejected.
@@ -317,12 +317,11 @@ class _Follower:
         self._last: PinnedPoint
         self._largest: FloatArray  # The largest margins so far.
         self._step, self._change = np.inf, np.zeros(self._system.num_states)
-        self._bound = np.inf
         self._integrator: scipy.integrate.Radau | None = None
 
     def points(self, guess: FloatArray) -> Iterator[PinnedPoint]:
         """Yields the points of the motion, one for each time."""
-        first, scale = self._at(self._time), self._system.scale
+        first = self._at(self._time)
         try:
             self._last = first.point(first.state(guess))
         except InconsistentStateError as error:
@@ -331,46 +330,48 @@ class _Follower:
         if self._last.flaw:
             raise self._stop(EndCause.SINGULAR_START, f"x = {show(self._last.state)}")
         self._largest = np.array(self._last.margins)
-        self._bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / scale)))
         yield self._last
+        largest = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / self._system.scale)))
         has_dynamics = self._pinned.structure.zero_dynamics_dimension > 0
-        advance = self._integrate if has_dynamics else self._continue
         for begin, end in pairwise(self._times):
             while self._time < end:
-                advance(end, end - begin)
+                if not (self._integrate(end, largest) if has_dynamics else self._continue(end)):
+                    self._step *= 0.5
+                    if self._step < SHORTEST * (end - begin):
+                        raise self._end(0.1 * (end - begin))
             yield self._last
 
-    def _continue(self, end: float, interval: float) -> None:
+    def _continue(self, end: float) -> bool:
         """A step without zero dynamics, by a predictor and Newton's method."""
         step, before = min(self._step, end - self._time), self._last
         time = end if step == end - self._time else self._time + step
         # Adams-Bashforth: x' and its change since the previous step.
-        if self._reach(time, before.state + step * (before.rate + 0.5 * step * self._change)):
-            self._step, self._change = 2.0 * step, (self._last.rate - before.rate) / step
-        else:
-            self._step = 0.5 * step
-            if self._step < SHORTEST * interval:
-                raise self._end(0.1 * interval)
+        guess = before.state + step * (before.rate + 0.5 * step * self._change)
+        self._step = step
+        if not self._reach(time, guess):
+            return False
+        self._step, self._change = 2.0 * step, (self._last.rate - before.rate) / step
+        return True
 
-    def _integrate(self, end: float, interval: float) -> None:
+    def _integrate(self, end: float, largest: float) -> bool:
         """A step with zero dynamics, by an implicit integrator, since they may be stiff."""
         integrator, scale = self._integrator or self._radau(end), self._system.scale
         self._integrator = integrator
         integrator.t_bound, integrator.status = end, "running"
         integrator.step()
+        self._step = integrator.t - self._time
         if integrator.status == "failed":
-            raise self._end(0.1 * interval)
+            self._step = 0.0
+            return False
         worst = int(np.argmax(np.abs(integrator.y) / scale))
-        if abs(integrator.y[worst]) > self._bound * scale[worst]:
+        if abs(integrator.y[worst]) > largest * scale[worst]:
             name = self._system.state_signals[worst].name
             raise self._stop(EndCause.UNBOUNDED, f"{name} = {integrator.y[worst]:.3g}")
         if self._reach(integrator.t, integrator.y):
             integrator.y, integrator.f = self._last.state.copy(), self._last.rate.copy()
-        else:
-            step = 0.5 * (integrator.t - self._time)
-            if step < SHORTEST * interval:
-                raise self._end(0.1 * interval)
-            self._integrator = self._radau(end, step)
+            return True
+        self._integrator = self._radau(end, 0.5 * self._step)
+        return False
 
     def _radau(self, end: float, step: float | None = None) -> "scipy.integrate.Radau":
         """An integrator of x' = f* + h* u from the last point."""
@@ -404,7 +405,7 @@ class _Follower:
         last, pinned = self._last, self._at(time)
         self._remaining -= 1
         if self._remaining < 0:
-            raise self._stop(EndCause.TOO_FAST, f"x = {show(last.state)}")
+            raise self._stop(EndCause.NO_WAY_ON, f"x = {show(last.state)}")
         projected, converged = pinned.project(state)
         near = JUMP * np.maximum(self._system.scale, np.abs(last.state))
         near += np.abs(state - last.state)
@@ -427,8 +428,7 @@ class _Follower:
             # grown by `GROWN` in the elapsed time; it may still be small, as for x' = exp(x).
             whole = self._times[-1] - self._times[0]
             elapsed = max(self._time - self._times[0], SHORTEST * whole)
-            size = np.maximum(1.0, np.abs(last.state) / system.scale)
-            rates = np.abs(last.rate) / system.scale * elapsed / size
+            rates = np.abs(last.rate) * elapsed / np.maximum(system.scale, np.abs(last.state))
             worst = int(np.argmax(rates))
             if not rates[worst] > GROWN:
                 return self._stop(EndCause.NO_WAY_ON, f"x = {show(last.state)}")

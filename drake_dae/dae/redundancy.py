@@ -27,10 +27,9 @@ PREFERRED = 0.5
 def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> DaeSystem:
     """Returns a system with the same motion in which redundant constraints are removed.
 
-    A constraint goes with the constraint input of the same number. The motion is the same, since
-    the inputs that remain act in all directions in which those that go did. The forces of the
-    remaining constraints depend on this choice: the split among redundant constraints is not
-    determined by (1)-(3), only the sum g(x) v is.
+    A constraint goes with the constraint input of the same number. The inputs that remain act in
+    all directions in which those that go did; their forces depend on the choice, since only the
+    sum g(x) v is determined by (1)-(3).
 
     Args:
         system: The system (1)-(3).
@@ -46,14 +45,15 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
     if names is None:
         names = [combination.name for combination in redundant_constraints(samples)]
     kept, left_out = _split(system, names)
-    if left_out:
-        gone = _check_same_motion(samples, kept, left_out)
-        if system.m[:, left_out].nnz():
-            raise ModelError(
-                f"{system.name}: an output is the force of {gone}, which is not determined where "
-                "constraints are redundant; choose other outputs, or leave out other constraints"
-            )
-    return with_constraints(system, kept) if left_out else system
+    if not left_out:
+        return system
+    gone = _check_same_motion(samples, kept, left_out)
+    if system.m[:, left_out].nnz():
+        raise ModelError(
+            f"{system.name}: an output is the force of {gone}, which is not determined where "
+            "constraints are redundant; choose other outputs, or leave out other constraints"
+        )
+    return with_constraints(system, kept)
 
 
 @checked(ModelError)
@@ -66,17 +66,14 @@ def share_forces(
     """Removes redundant constraints and distributes the forces among all by least squares.
 
     On N* the input of a constraint that is left out acts as a combination of those that stay, E^-1
-    g_out = E^-1 g D, so that the motion follows from v = v_stay + D v_out alone, and all v_all =
-    (v_stay, v_out) with one v move the system in the same way: the split among redundant
-    constraints is not determined by (1)-(3). The reported split has the least sum of c_i v_i^2,
+    g_out = E^-1 g D: the motion follows from v = v_stay + D v_out alone. The reported split
+    v_all = (v_stay, v_out) has the least sum of c_i v_i^2,
 
         v_all = T v,   T = C^-1 G^T (G C^-1 G^T)^-1,   G = [1, D],   C = diag(c_1, ..., c_M),
 
     and does not depend on which constraints are kept. It is physical if the c_i are the compliances
     of the constrained parts, in m/N or rad/(N m): stiff springs in place of the constraints share a
-    slowly changing force in this way (Menabrea 1858). Only ratios matter. With all c_i = 1, the
-    default, stiffnesses are equal in SI units, which means little if forces and moments are
-    redundant together.
+    slowly changing force in this way (Menabrea 1858). Only ratios matter.
 
     The system has the constraints that stay, and its `sharing` shows the forces of all on the port
     `constraint_force` of a plant. Those that are kept must stay independent along the whole motion,
@@ -150,8 +147,8 @@ def all_constraints_hold(system: DaeSystem) -> Samples:
 def _split(system: DaeSystem, names: Sequence[str]) -> tuple[list[int], list[int]]:
     """The indices of the constraints that stay, and of those that are named."""
     signals = system.constraint_output_signals
-    left_out = sorted(set(places_of("constraint", names, signals, f"{system.name}: ")))
-    return [i for i in range(len(signals)) if i not in left_out], left_out
+    left_out = set(places_of("constraint", names, signals, f"{system.name}: "))
+    return [i for i in range(len(signals)) if i not in left_out], sorted(left_out)
 
 
 def _independent(samples: Samples) -> tuple[list[int], list[int]]:
@@ -182,18 +179,14 @@ def _check_same_motion(samples: Samples, kept: list[int], left_out: list[int]) -
     names = ", ".join(f"'{signal.name}'" for signal in system.exogenous.signals)
     for (by_state, moved), fields in zip(gradients, samples.fields, strict=True):
         gradient = by_state * system.scale
-        for rows, why in (
-            (gradient, "its gradients are not combinations of those of the remaining constraints"),
-            (
-                np.hstack([gradient, moved]),
-                f"where the exogenous signals {names} move, the constraints left out are no longer "
-                "implied by the remaining ones",
-            ),
-            (
-                fields["g"].T / system.scale,
-                "its columns of g are not combinations of the remaining columns",
-            ),
-        ):
+        checks = {
+            "its gradients are not combinations of those of the remaining constraints": gradient,
+            f"where the exogenous signals {names} move, the constraints left out are no longer "
+            "implied by the remaining ones": np.hstack([gradient, moved]),
+            "its columns of g are not combinations of the remaining columns": fields["g"].T
+            / system.scale,
+        }
+        for why, rows in checks.items():
             if rank_of(significant(rows)[kept]) < rank_of(rows):
                 raise ModelError(f"{system.name}: {gone} cannot be left out: {why}")
     return gone
@@ -201,14 +194,12 @@ def _check_same_motion(samples: Samples, kept: list[int], left_out: list[int]) -
 
 def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:
     """The system with only some of its constraints and their inputs."""
-    whole, implicit = system.implicit, None
-    if whole is not None:
 
-        def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
-            every = ca.SX(system.num_constraints, 1)
-            every[kept] = constraint_input
-            rest, constraint_rate = whole(rate, every)
-            return rest, constraint_rate[kept]
+    def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
+        every = ca.SX(system.num_constraints, 1)
+        every[kept] = constraint_input
+        rest, constraint_rate = system.implicit(rate, every)  # type: ignore[misc]
+        return rest, constraint_rate[kept]
 
     signals = tuple(system.constraint_input_signals[i] for i in kept)
     names = {signal.name for signal in signals}
@@ -220,7 +211,7 @@ def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:
         contacts=tuple(contact for contact in system.contacts if contact.force in names),
         constraint_input_signals=signals,
         constraint_output_signals=tuple(system.constraint_output_signals[i] for i in kept),
-        implicit=implicit,
+        implicit=implicit if system.implicit else None,
     )
 
 

@@ -226,12 +226,11 @@ class _OtherDegrees:
             value, size = (each[of] for each in row(state, parameters))
             return bool(np.any(np.abs(value) > VISIBLE * size))
 
-        if i not in self._violations:
-            deciding = Family(samples.manifold, samples.states).deciding(acts)
-            if deciding:
-                names, kind = (self._names[i],), ViolationKind.NUMBERS
-                violation = Violation(assumption, kind, names, order, deciding=deciding)
-                self._violations[i] = violation
+        if i in self._violations:
+            return
+        if deciding := Family(samples.manifold, samples.states).deciding(acts):
+            names, kind = (self._names[i],), ViolationKind.NUMBERS
+            self._violations[i] = Violation(assumption, kind, names, order, deciding=deciding)
 
     def check(self, i: int) -> None:
         """Raises the violation of one whose degree is another one for other parameters."""
@@ -241,12 +240,14 @@ class _OtherDegrees:
     def never(self, kind: ViolationKind, stuck: Sequence[int], samples: Samples) -> AssumptionError:
         """The error of constraints or outputs on which no input ever acts."""
         is_constraint = kind is ViolationKind.NO_FORCE
-        dependent = redundant_constraints(samples) if is_constraint else ()
-        known = self._violations
-        deciding = next((known[i].deciding for i in stuck if i in known), None)
-        those, assumption = tuple(self._names[i] for i in stuck), 2 if is_constraint else 5
-        violation = Violation(assumption, kind, those, combinations=dependent, deciding=deciding)
-        return violation.error()
+        found = [self._violations[i].deciding for i in stuck if i in self._violations]
+        return Violation(
+            2 if is_constraint else 5,
+            kind,
+            tuple(self._names[i] for i in stuck),
+            combinations=redundant_constraints(samples) if is_constraint else (),
+            deciding=found[0] if found else None,
+        ).error()
 
 
 def _reached(fields: ca.SX, drift: ca.SX, expressions: ca.SX, state: ca.SX) -> Booleans:

@@ -83,8 +83,7 @@ class Samples:
     ) -> FloatArray:
         """Minimizes a nonnegative function along N* in the box that the states span.
 
-        Steps lead to the zero of the linearized function. Zeros are found in a few steps; a
-        positive minimum is only approached.
+        Steps lead to the zero of the linearized function; a positive minimum is only approached.
         """
         low, high = self._box
         width, manifold = high - low, self.manifold

@@ -64,8 +64,8 @@ def places_of(
 class Parameter:
     """A number, or a vector of numbers, whose value can change without tracing the equations again.
 
-    An exogenous one is a signal w(t) that is not controlled but has known derivatives, as a
-    reference has: the position of a moving surface, a known load, time.
+    An exogenous one is a signal w(t) with known derivatives: the position of a moving surface, a
+    known load, time.
 
     Attributes:
         name: Its name, unique in its system, for example "link1.mass".
@@ -75,11 +75,10 @@ class Parameter:
         symbol: The CasADi symbol that stands for it, shape (k, 1). Made where not given.
         exogenous: Whether it moves.
         nonnegative: Whether negative numbers make no sense, as for a coefficient of friction.
-        bounds: The range (low, high) of its values, each a number or of shape (k,). Relative
-            degrees must be the same in this range. If None, half and twice the default, or -1 and 1
-            where the default is 0. Equal bounds fix the value; the signal is then constant.
-        derivatives: The symbols of w', w'', ..., each of shape (k, 1), if it moves. Made where not
-            given.
+        bounds: The range (low, high) of its values, each a number or of shape (k,), in which
+            relative degrees must be the same. If None, half and twice the default, or -1 and 1
+            where it is 0. Equal bounds fix the value.
+        derivatives: The symbols of w', w'', ..., each of shape (k, 1), if it moves.
 
     Raises:
         ModelError: The value is not finite or out of its bounds, or the symbol does not fit it.
@@ -122,17 +121,15 @@ class Parameter:
     @property
     def low(self) -> FloatArray:
         """The lowest values for which relative degrees are checked, shape (k,)."""
-        if self.bounds is not None:
-            return self.entries(self.bounds[0])
-        least = -1.0 if not (self.positive or self.nonnegative) else 0.0
-        return np.where(self.value == 0.0, least, np.minimum(0.5 * self.value, 2.0 * self.value))
+        least = 0.0 if self.positive or self.nonnegative else -1.0
+        usual = np.where(self.value == 0.0, least, np.minimum(0.5 * self.value, 2.0 * self.value))
+        return usual if self.bounds is None else self.entries(self.bounds[0])
 
     @property
     def high(self) -> FloatArray:
         """The highest values for which relative degrees are checked, shape (k,)."""
-        if self.bounds is not None:
-            return self.entries(self.bounds[1])
-        return np.where(self.value == 0.0, 1.0, np.maximum(0.5 * self.value, 2.0 * self.value))
+        usual = np.where(self.value == 0.0, 1.0, np.maximum(0.5 * self.value, 2.0 * self.value))
+        return usual if self.bounds is None else self.entries(self.bounds[1])
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -219,9 +216,7 @@ class Exogenous:
         """Returns the number of derivatives of each entry of w on which expressions depend."""
         every = ca.veccat(*expressions)
         return tuple(
-            max(
-                (k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i])), default=0
-            )
+            max([0, *(k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i]))])
             for p in self.moving
             for i in range(p.value.size)
         )

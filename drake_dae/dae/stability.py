@@ -1,9 +1,8 @@
 """Stability of the zero dynamics: eigenvalues at rest, Floquet multipliers along R(t).   (35)-(36)
 
-To first order a disturbance delta of a state on Z(R) moves by delta' = (dx'/dx) delta, with the
-derivative of x' = f* + h* u at fixed R, and stays tangent to Z(R). At an equilibrium its
-eigenvalues on the tangent space decide. In bases T of the tangent spaces a period of a periodic
-motion takes T c to T M c; the eigenvalues of M are the multipliers.
+A small disturbance of a state on Z(R) moves by delta' = (dx'/dx) delta, x' = f* + h* u at fixed R,
+and stays tangent to Z(R). At an equilibrium the eigenvalues on the tangent space decide. In bases T
+of the tangent spaces a period takes T c to T M c; the eigenvalues of M are the multipliers.
 """
 
 import warnings

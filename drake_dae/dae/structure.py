@@ -138,12 +138,10 @@ class Structure(ConstraintStructure):
 
         If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
         """
-        solution: tuple[ca.SX, ...] | None = None
-        if self.system.control_metric is None:
-            solution = self.derivatives.inverse(self.highest_derivatives, commanded)  # (28)
-        if solution is None:  # L_h* of an output vanishes, but not by structure.
-            solution = self.control_by_matrix(commanded)
-        control, pivot, *_ = solution
+        chosen = self.system.control_metric is not None
+        solution = None if chosen else self.derivatives.inverse(self.highest_derivatives, commanded)
+        # L_h* of an output may vanish, but not by structure.
+        control, pivot, *_ = solution or self.control_by_matrix(commanded)  # (28)
         if self.chains_need_force:
             pivot = ca.fmin(pivot, self.elimination.pivot)
         return control, pivot
@@ -165,10 +163,8 @@ def find_constraint_structure(
     structure, samples = _sound_constraints(system, spread, count, seed)
     # Rows of n* that are only round-off are no feedthrough.
     actions = InputActions(samples, structure.elimination)
-    acts = actions.numbers(actions.feedthrough).any(axis=(0, 2))
-    rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
-    feedthrough = ca.sparsify(ca.mtimes(rows, structure.elimination.n_star))
-    return replace(structure, elimination=replace(structure.elimination, n_star=feedthrough))
+    acts = np.asarray(actions.numbers(actions.feedthrough).any(axis=(0, 2)))
+    return replace(structure, elimination=_with_feedthrough(structure.elimination, acts))
 
 
 @checked(ModelError)
@@ -179,9 +175,8 @@ def find_structure(
 
     Whether an expression is zero is decided by its structure first, then by its numbers at
     consistent states drawn around `system.nominal_state`, with the default parameters and exogenous
-    signals at rest. An expression that is zero there must be zero for all other values of
-    parameters, signals and their derivatives, see `Parameter.bounds`; otherwise the degree would
-    change with them, and the system is refused.
+    signals at rest. What is zero there must be zero for all other values of parameters, signals and
+    their derivatives, see `Parameter.bounds`; otherwise the system is refused.
 
     Args:
         system: The system (1)-(3).
@@ -197,20 +192,19 @@ def find_structure(
             function is not finite at the nominal state, or the mass matrix or the metric is not
             symmetric and positive definite.
     """
-    structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
-    if violation:
+    structure = examine_structure(system, spread=spread, count=count, seed=seed)
+    if violation := control_violation(structure):
         raise violation.error()
     return structure
 
 
 def examine_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
-) -> tuple[Structure, Violation | None]:
-    """Finds the structure as `find_structure`, but also returns it where B(x) is singular."""
+) -> Structure:
+    """Finds the structure as `find_structure`, also where B(x) is singular."""
     if why := why_no_law(system):
         raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
-    structure = examine_outputs(*_sound_constraints(system, spread, count, seed))
-    return structure, control_violation(structure)
+    return examine_outputs(*_sound_constraints(system, spread, count, seed))
 
 
 def structure_of(
@@ -274,9 +268,8 @@ def _check_positive_definite(system: DaeSystem, key: str, states: FloatArray) ->
             if is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12:
                 continue
         remedy = (
-            "An equation in which no derivative stands is a constraint 0 = k(x) with a constraint "
-            "input; where it holds an unknown z that has no derivative, lift it: make z a state "
-            "with z' = v, v a new constraint input, and keep the equation as constraint"
+            "An equation in which no derivative stands is a constraint 0 = k(x); make an unknown z "
+            "in it, which has no derivative, a state with z' = v, v a new constraint input"
         )
         if key == "control_metric":
             remedy = "Give each control a positive weight"
@@ -321,15 +314,17 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
         _check_positive_definite(system, "control_metric", samples.states)
     outputs = output_chains(constrained.derivatives, elimination, samples)
     degrees = tuple(len(chain) for chain in outputs["output_chains"])
-    # Rows of n* that are zero except for round-off are no feedthrough.
-    n_star = [
-        ca.SX(1, system.num_controls) if degree else elimination.n_star[i, :]
-        for i, degree in enumerate(degrees)
-    ]
     attributes = {item.name: getattr(constrained, item.name) for item in fields(constrained)}
-    attributes["elimination"] = replace(elimination, n_star=ca.vertcat(*n_star))
+    # Rows of n* that are zero except for round-off are no feedthrough.
+    attributes["elimination"] = _with_feedthrough(elimination, np.array(degrees) == 0)
     margin = find_margin(samples, outputs["control_matrix"], outputs["round_off"])
     return Structure(**attributes, output_degrees=degrees, control_margin=margin, **outputs)
+
+
+def _with_feedthrough(elimination: Elimination, acts: Booleans) -> Elimination:
+    """The elimination with some rows of n* alone."""
+    rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
+    return replace(elimination, n_star=ca.sparsify(ca.mtimes(rows, elimination.n_star)))
 
 
 def constraint_violation(structure: ConstraintStructure) -> Violation | None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
+from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.dae.contacts import Contacts, UnilateralInput
 from drake_dae.dae.fields import checked_fields, fields_of_functions
 from drake_dae.dae.signals import Exogenous, Parameter, Signal, parameter_symbol
@@ -49,7 +49,7 @@ class DaeSystem:
         f, g, h: The drift and the input matrices of v and u, shapes (n, 1), (n, m) and (n, p).
         k: The constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
         l, m: The controlled outputs z, shapes (q, 1) and (q, m). A law (28) needs q = p, or fewer
-            with a `control_metric`; a system that is only simulated may have any number.
+            with a `control_metric`.
         parameters: Named numbers that the expressions depend on.
         *_signals: Names and units of x, v, u, y, z; "x0", "x1", ... where not given.
         nominal_state: The initial guess for consistent states, shape (n,); zero if None.
@@ -60,8 +60,7 @@ class DaeSystem:
             takes fewer operations: for a robot it is inverse dynamics.
         sharing: The forces of redundant constraints, from `share_forces`.
         control_metric, free_control: W, shape (p, p), and u_0: with more controls than outputs (28)
-            takes u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0), nearest to u_0. Make the
-            terms of u^T W u comparable, as by 1 / limit^2.
+            takes u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0), nearest to u_0.
         compiled: Machine code from the first call (True), never, or when it pays ("auto").
         least_margin: A(x) or B(x) is singular where its smallest singular value, scaled, is below.
         contacts: Constraint inputs that only push, if one has friction: see `contacts`.
@@ -127,8 +126,7 @@ class DaeSystem:
 
         Each function is called once with a CasADi column x, and, if there are `parameters`, with a
         namespace p of their symbols: `f=lambda x, p: [x[1], -p.stiffness * x[0]]`. It returns an
-        expression, or a list (of lists for a matrix, row by row). Use functions of CasADi, such as
-        casadi.sin; math.sin does not work.
+        expression, or a list (of lists for a matrix, row by row), made by functions of CasADi.
 
         Args:
             state: Names (or Signals) of the states, or their number n.
@@ -165,8 +163,7 @@ class DaeSystem:
     @cached_property
     def fields(self) -> TracedFunction:
         """The function (state, parameters) -> f, g, h, l, m of the system with E = 1."""
-        e = self.explicit
-        outputs = {"f": e.f, "g": e.g, "h": e.h, "l": e.l, "m": e.m}
+        outputs = {key: getattr(self.explicit, key) for key in "fghlm"}
         return self.trace("fields", outputs, often=False)
 
     @cached_property
@@ -205,14 +202,12 @@ class DaeSystem:
     ) -> Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None:
         """Returns `implicit` with a term, a function of x', added to its balance; None if None."""
         inner = self.implicit
-        if inner is None:
-            return None
 
         def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
-            balance, constraint_rate = inner(rate, constraint_input)
+            balance, constraint_rate = inner(rate, constraint_input)  # type: ignore[misc]
             return balance + term(rate), constraint_rate
 
-        return implicit
+        return implicit if inner else None
 
     def outputs(self, constraint_input: ca.SX) -> ca.SX:
         """Returns the controlled outputs z = l(x) + m(x) v (3), shape (p, 1)."""
@@ -263,9 +258,7 @@ class DaeSystem:
     def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
         """Returns the same system with bounds for some parameters: name -> (low, high).
 
-        Relative degrees must be the same for all values of the parameters: an input acts on a
-        derivative for all of them or for none. Bounds restrict the values to those for which this
-        holds; see `Parameter`.
+        Relative degrees must be the same for all values within them; see `Parameter`.
         """
         return self._with_parameters("bounds", bounds)
 
@@ -289,9 +282,8 @@ class DaeSystem:
 
         Derivatives of signals are bounded by the size of the signal, or 1, per second.
         """
-        low, high = (
-            [np.zeros(0), *[getattr(p, k) for p in self.parameters]] for k in ("low", "high")
-        )
+        low = [np.zeros(0), *[p.low for p in self.parameters]]
+        high = [np.zeros(0), *[p.high for p in self.parameters]]
         for p in self.exogenous.moving:
             size = np.where(p.low < p.high, np.where(p.value == 0.0, 1.0, np.abs(p.value)), 0.0)
             low += [-size] * len(p.derivatives)
@@ -340,28 +332,24 @@ class DaeSystem:
         return lambda state, parameters: function(state, parameters)[0].reshape(expression.shape)
 
     def agree(self, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
-        """Returns whether two expressions agree at random states around the nominal state.
+        """Returns whether two expressions agree at random states and parameters near the nominal.
 
-        The parameters are varied as well.
+        States at which they are not finite, out of their domain, are left out.
         """
         symbols = [self.state, *unknowns, self.parameter_symbol]
         function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
         random, p = np.random.default_rng(0), self.parameter_values
-        deviation = self.spread_around(self.nominal_state)
-        finite = 0
+        deviation, agree = self.spread_around(self.nominal_state), list[bool]()
         for spread in (0.0, 0.1, 0.1):
             x = self.nominal_state + deviation * random.standard_normal(self.num_states)
             numbers = [random.standard_normal(u.numel()) for u in unknowns]
             changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
             a, b = (v.full() for v in function(x, *numbers, changed))
-            if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
-                continue  # Out of the domain of one of the functions.
-            finite += 1
             # By columns: constraints may have very different units.
             size = np.abs(a).max(axis=0, initial=0.0) + np.abs(b).max(axis=0, initial=0.0)
-            if not np.all(np.abs(a - b) <= 1e-9 * np.abs(b) + 1e-11 * size):
-                return False
-        return finite > 0
+            if np.all(np.isfinite(size)):
+                agree.append(bool(np.all(np.abs(a - b) <= 1e-9 * np.abs(b) + 1e-11 * size)))
+        return bool(agree) and all(agree)
 
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
         """Checks a parameter vector, the default if None; do not change the array."""
@@ -381,28 +369,17 @@ class DaeSystem:
         """Returns the parameter vector of this system with the values that another system has.
 
         Those are taken that have the same name and size in both, with their derivatives if they are
-        exogenous. The values have shape (k,) or (samples, k).
+        exogenous.
         """
-        values, size = numbers("values", values), other.parameter_symbol.numel()
-        if values.ndim not in (1, 2) or values.shape[-1] != size:
-            raise ModelError(
-                f"{self.name}: values must have shape ({size},) or (samples, {size}), got "
-                f"{values.shape}"
-            )
-        parameters = np.empty((*values.shape[:-1], self._defaults.size))
-        parameters[...] = self._defaults
+        given, found = other.parameter_vector(values), self.parameter_values
         sizes = {p.name: p.value.size for p in other.parameters}
         own, others = self.exogenous, other.exogenous
         for p in self.parameters:
-            if sizes.get(p.name) != p.value.size:
-                continue
-            parameters[..., own.slices[p.name]] = values[..., others.slices[p.name]]
-            if p.name in own.rates and p.name in others.rates:
-                moved = values[..., others.rates[p.name]]
-                to = parameters[..., own.rates[p.name]]
-                count = min(to.shape[-1], moved.shape[-1])
-                to[..., :count] = moved[..., :count]
-        return parameters
+            if sizes.get(p.name) == p.value.size:
+                found[own.slices[p.name]] = given[others.slices[p.name]]
+                if p.name in own.rates and p.name in others.rates:
+                    found[own.rates[p.name]] = given[others.rates[p.name]]
+        return found
 
     def state_vector(self, state: ArrayLike) -> FloatArray:
         """Checks a state and returns it as a new array of shape (n,)."""

@@ -1,8 +1,7 @@
 """What the system does while its outputs follow a reference: Assumption 2.2.        (35)-(36)
 
-On Z(R), see `pinned_motion`, the state moves by x' = f* + h* u. Its dimension is that of xi; where
-that is 0, the reference alone determines the motion. All is done in the state x: nothing depends
-on the choice of xi in (22).
+On Z(R), see `pinned_motion`, the state moves by x' = f* + h* u. All is done in the state x: nothing
+depends on the choice of xi in (22).
 """
 
 from collections.abc import Callable, Sequence
@@ -98,8 +97,8 @@ class ZeroDynamics:
         """Computes the motion on Z(R(t)) from a state close to the guess, until it ends.
 
         Without zero dynamics each state follows from the one before by Newton's method. Else
-        x' = f* + h* u is integrated (Radau IIA of order 5) and projected after each step.
-        Why it ends before the last time is in the returned motion; see `PinnedMotion.ending`.
+        x' = f* + h* u is integrated (Radau IIA of order 5) and projected after each step. Why it
+        ends before the last time is in `PinnedMotion.ending`.
 
         Args:
             reference: The function t -> R(t); it is also evaluated between the times.
@@ -127,8 +126,7 @@ class ZeroDynamics:
         """Judges by linearization whether Assumption 2.2 holds near an equilibrium.
 
         The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; its
-        eigenvalues there decide. In closed loop they stand beside the roots of (32). Those of a
-        linear system are its invariant zeros.
+        eigenvalues there decide, of a linear system its invariant zeros.
 
         Args:
             state: The initial guess of the equilibrium.
@@ -191,9 +189,9 @@ class ZeroDynamics:
     ) -> StabilityAlong:
         """Judges by Floquet multipliers whether Assumption 2.2 holds along a periodic reference.
 
-        The motion with the same period is sought, by Newton's method from late in the given motion,
-        and from its start. The multipliers are the eigenvalues of the matrix that takes small
-        disturbances of it, delta' = (dx'/dx) delta on Z(R(t)), through one period.
+        The motion with the same period is sought by Newton's method from the given one. The
+        multipliers are the eigenvalues of the matrix that takes small disturbances of it,
+        delta' = (dx'/dx) delta on Z(R(t)), through one period.
 
         Args:
             reference, exogenous: As for `motion`.
@@ -271,9 +269,8 @@ class ZeroDynamics:
     ) -> tuple[FloatArray, int]:
         """Returns a state at rest, by Newton's method for C(x) = 0 and T^T x' = 0 from a guess.
 
-        T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
-        shortest step is taken. Also returns the number of directions in which it is singular at the
-        state; none if it must be regular.
+        T spans the tangent space of Z(R). Also returns the number of directions in which the
+        Jacobian is singular at the state, where steps are shortest; none if it must be regular.
         """
         system, scale = self.system, self.system.scale
 

@@ -195,8 +195,12 @@ def recorded_run(
     code: BlockCode,
     inputs: Mapping[str, Port],
     outputs: Mapping[str, Port],
+    acts_at_once: bool = False,
 ) -> str:
-    """A run as CSV: the time in s, inputs before the updates of the instant, outputs after them."""
+    """A run as CSV: the time in s, the inputs, and the resulting outputs.
+
+    Inputs are those before the updates of the instant, outputs those after, or at once before.
+    """
     simulator = Simulator(diagram, context.Clone())
     ApplySimulatorConfig(config, simulator)
     own = simulator.get_mutable_context()
@@ -218,6 +222,8 @@ def recorded_run(
         if time > own.get_time():
             simulator.AdvanceTo(time)
         row = [own.get_time(), *values(inputs)]
+        row += values(outputs) if acts_at_once else []
         simulator.AdvancePendingEvents()
-        lines.append(",".join(map(repr, [*row, *values(outputs)])))
+        row += [] if acts_at_once else values(outputs)
+        lines.append(",".join(map(repr, row)))
     return "\n".join([*lines, ""])

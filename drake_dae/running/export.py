@@ -103,7 +103,7 @@ def export_controller(
     ticks, start, code = part.ticks, context.get_time(), part.code
     count = max(1, min(MOST, floor(duration / ticks.period + 1e-9)))
     times = [ticks.time(ticks.at(start) + k) for k in range(count)]
-    given = times, code, part.inputs, part.outputs
+    given = times, code, part.inputs, part.outputs, part.acts_at_once
     run = recorded_run(diagram, context, config or SimulatorConfig(), *given)
     words = part.words(name, start)
     files = {f"{file_of(name)}_controller.{end}": f"controller.{end}" for end in ("h", "c")}
@@ -118,8 +118,11 @@ class Ticks:
     `rates` are (period, offset) -> the number of ticks between updates, and the tick of the first.
     """
 
-    def __init__(self, rates: list[tuple[float, float]]) -> None:
-        """Of updates with these periods and offsets."""
+    def __init__(self, rates: list[tuple[float, float]], alone: float = 0.0) -> None:
+        """Of updates with these periods and offsets; without any each period is `alone`."""
+        self.period, self.rates = alone, dict[tuple[float, float], tuple[int, int]]()
+        if not rates:
+            return
         # Without the round-off of computed times.
         exact = {rate: [Fraction(t).limit_denominator(10**9) for t in rate] for rate in rates}
         times = [time for pair in exact.values() for time in pair]
@@ -150,7 +153,10 @@ class Ticks:
 
 
 class ControllerPart:
-    """The controller of a diagram with one `Plant`, and its inputs' and outputs' ports there."""
+    """The controller of a diagram with one `Plant`, and the ports of its inputs and outputs there.
+
+    It acts at once if the control has direct feedthrough from measurements.
+    """
 
     def __init__(self, diagram: Diagram, context: Context) -> None:
         machine = list(_machine(diagram))
@@ -176,7 +182,11 @@ class ControllerPart:
             if is_vector and leaf_port(port)[0] in leading and leaf_port(port) != control:
                 outputs.setdefault(port.get_name(), port)
         composed = compose(diagram, outputs, cuts=measured, context=context)
-        block = _checked(composed, measured)
+        block, self.acts_at_once = _checked(composed, measured)
+        if self.acts_at_once and not plant.time_step:
+            raise ModelError(
+                f"the controller acts continuously, and as one step it needs samples: {SAMPLING}"
+            )
         known: Vectors = {
             **port_signals(plant.structure),
             **plant.further_signals,
@@ -189,7 +199,7 @@ class ControllerPart:
         inputs = {name: signals for name, signals in inputs.items() if name in measured}
         self.code = BlockCode(replace(composed, block=block), context, inputs, known)
         rates = [(rate.period, rate.offset) for rate in self.code.steps.rates]
-        self.ticks = Ticks(rates)
+        self.ticks = Ticks(rates, plant.time_step)
         self.inputs = {name: leaf_port(measured[name]) for name in inputs}
         self.outputs = {name: leaf_port(outputs[name]) for name in block.outputs}
 
@@ -209,7 +219,8 @@ class ControllerPart:
                     given = f"generated_update_{i}, c, time, before, held + {rate.places[0]}"
                     calls.append(f"  {due} {{\n    evaluate({given});\n  }}\n")
             updates += ["  memcpy(before, held, sizeof(before));\n", *calls] if calls else []
-        steps = [*moments, *updates, "  evaluate(generated_row, c, time, held, row);\n"]
+        shown = ["  evaluate(generated_row, c, time, held, row);\n"]
+        steps = [*moments, *(shown + updates if self.acts_at_once else updates + shown)]
         begin = ""
         if "begin" in code.steps.functions:
             at = f"{ticks.time(first)!r}"
@@ -241,8 +252,8 @@ def _machine(diagram: Diagram) -> Iterator[Any]:
             yield from _machine(system)
 
 
-def _checked(composed: Composed, measured: Mapping[str, OutputPort]) -> Block:
-    """A controller's block without outputs that act at once, which its control must not."""
+def _checked(composed: Composed, measured: Mapping[str, OutputPort]) -> tuple[Block, bool]:
+    """A controller's block without outputs that act at once, and whether its control does."""
     block = composed.block
     for system in composed.states:
         raise ModelError(
@@ -257,16 +268,17 @@ def _checked(composed: Composed, measured: Mapping[str, OutputPort]) -> Block:
     if not composed.cuts:
         raise ModelError("the controller reads nothing that is measured, so that none is needed")
     given = stacked([block.inputs[name] for name in composed.cuts])
-    if ca.depends_on(block.outputs[CONTROL], given):
-        raise ModelError(
-            f"the controller acts continuously, and as one step it needs samples: {SAMPLING}"
-        )
-    outputs = {n: value for n, value in block.outputs.items() if not ca.depends_on(value, given)}
+    acts_at_once = bool(ca.depends_on(block.outputs[CONTROL], given))
+    outputs = {
+        name: value
+        for name, value in block.outputs.items()
+        if name == CONTROL or not ca.depends_on(value, given)
+    }
     held = [each for one in block.held.values() for each in (one.next, one.begin)]
     used = block.sources(*outputs.values(), *(each for each in held if each is not None))
     left_out = [name for name in composed.cuts if f"input {name}" not in used]
     inputs = {name: symbol for name, symbol in block.inputs.items() if name not in left_out}
-    return replace(block, inputs=inputs, outputs=outputs)
+    return replace(block, inputs=inputs, outputs=outputs), acts_at_once
 
 
 @checked(ModelError)

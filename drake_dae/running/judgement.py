@@ -10,7 +10,7 @@ from functools import cached_property
 from math import isfinite
 from signal import Signals
 from textwrap import fill
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +31,7 @@ PURE = {"": 1.0, "rad": 1.0}  # The least size of numbers without a unit, and of
 
 WIDTH, MOST = 100, 6  # The width of a paragraph; the most findings that follow the first one.
 UNEXCITED = 0.5  # A parameter is not excited whose deviation is above this share of that at first.
+ANALYZE = "`drake-dae analyze` says whether slower references keep the limits"
 SURE = 2.0  # The number of deviations from which an estimate differs from what the law believes.
 
 _FORCES = (LimitKind.FORCE, LimitKind.CONTROL, LimitKind.EFFORT)
@@ -121,7 +122,6 @@ class RunSummary:
     reasons: Sequence[str] = ()  # of a deviation from the prediction
     more: Sequence[RunFinding] = ()
     statistics: RunStatistics | None = None  # None for a failed run
-    remedies: Sequence[str] = ()  # what to look at beside the causes of the findings
     notes: Sequence[str] = ()  # what is approximate
     named: Collection[str] = ()  # the parameters that the user had estimated
 
@@ -146,8 +146,8 @@ class RunSummary:
         kinds = {*LimitKind} - ({LimitKind.FORCE} if "contact_force" in record else set())
         beyond = [r.excess for r in self.ranges if r.kind in kinds and r.excess is not None]
         for excess in sorted(beyond, key=lambda e: -abs(e.value / e.limit) if e.limit else -np.inf):
-            numbers = excess.signal, excess.value, excess.limit, excess.time
-            found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *numbers))
+            more = excess.signal, excess.value, excess.limit, excess.time, ANALYZE
+            found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *more))
         found += self.more
         if self.changes:
             found += self._of_task()
@@ -215,20 +215,14 @@ class RunSummary:
         forced = (r for r in self.ranges if r.kind is LimitKind.FORCE)
         pushing = {r.signal.name for r in forced if r.low == 0.0}
         for signal, values in zip(forces.signals, forces.values.T, strict=True):
-            touches, decides = np.flatnonzero(values > 0.0), cast(Outcome | None, Outcome.BAD)
-            is_other = not touches.size and (values.size < 2 or values.any())
-            if signal.name not in pushing or is_other:
+            touched = int(np.argmax(values > 0.0))  # 0 if it never is.
+            lost = touched + np.flatnonzero(values[touched:-1] == 0.0)
+            if signal.name not in pushing or not lost.size:
                 continue
-            if not touches.size:
-                text, first = f"{signal.name} is 0 all the time", times[0]
-            else:
-                lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
-                if not lost.size:
-                    continue
-                first, lasted = times[lost[0]], np.diff(times)[lost].sum()
-                text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
-                if times[lost[-1]] < 0.5 * (times[0] + times[-1]):
-                    decides = None
+            first, lasted = times[lost[0]], np.diff(times)[lost].sum()
+            text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
+            is_late = times[lost[-1]] >= 0.5 * (times[0] + times[-1])
+            decides = Outcome.BAD if is_late else None
             yield RunFinding(FindingKind.CONTACT, text, decides, signal, 0.0, time=float(first))
 
     def _of_outputs(self) -> Iterator[RunFinding]:
@@ -305,8 +299,7 @@ class RunSummary:
     @property
     def look_next(self) -> list[str]:
         """What to change, or to look at."""
-        causes = [f.cause for f in self.findings if f.decides and f.cause]
-        return list(dict.fromkeys([*self.remedies, *causes]))
+        return list(dict.fromkeys(f.cause for f in self.findings if f.decides and f.cause))
 
     @property
     def residual(self) -> dict[str, float]:

@@ -173,6 +173,7 @@ class _Progress:
             file=sys.stderr,
             bar_format=form,
             ncols=79,
+            nrows=24,  # Some containers report neither.
         )
         self._began = self._last = time.perf_counter()
 

@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from math import ceil, floor
+from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import casadi as ca
@@ -18,18 +19,12 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.blocks.block import NOTHING, Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae import ConstraintStructure, DaeSystem, Structure, TrackingLaw
+from drake_dae.dae import ConstraintStructure, Structure, TrackingLaw
 from drake_dae.dae.disturbance import estimated_within
 from drake_dae.diagrams import parts
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop, wire_loop
 from drake_dae.diagrams.record import Record, RecordAfter
-from drake_dae.errors import (
-    AssumptionError,
-    DrakeDaeError,
-    ModelError,
-    ScenarioError,
-    SimulationError,
-)
+from drake_dae.errors import AssumptionError, ModelError, ScenarioError, SimulationError
 from drake_dae.pictures.page_controls import PUSH
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import KnownWrench, Load, PointOnSurface, RobotModel, ScaledForce
@@ -37,14 +32,14 @@ from drake_dae.running.diagnosis import DivergenceWatch
 from drake_dae.running.rollout import Rollout, run_loop, start_values
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.gains import advised, estimates_all, estimating_all, estimating_friction
+from drake_dae.scenario.gains import advised, estimates_all, estimating_all
 from drake_dae.scenario.model import (
     completed_model,
     exogenous_references,
     references_of,
     scenario_structure,
 )
-from drake_dae.scenario.parts import Poles
+from drake_dae.scenario.parts import CompliantContact, MultibodyPlant, Poles
 from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
@@ -57,8 +52,6 @@ ROWS, MOST_ROWS = 1000, 1e7
 # The time by the clock in s between checks of a running rollout for divergence; and the fraction of
 # a step within which two times are equal.
 PERIOD, SAME = 0.2, 1e-6
-# What a person may change in a page beside references.
-_ROUGH, _DRAGGED = "friction of the plant", "surfaces that are dragged"
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -97,6 +90,8 @@ def build_completed(
         for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
             if getattr(scenario, key):
                 raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
+        if commanded:
+            raise ScenarioError(("robot.actuators", "needed: a page shows what a law steers"))
         free = dae.find_constraint_structure(model.dae)
         plant = make_plant(completed.scenario, model, free)
         return completed, wire_loop(plant, _NoController(free), **drawn)
@@ -132,13 +127,14 @@ def build_completed(
         plant = make_plant(scenario, model, structure)
 
     # The law, of a model with a disturbance if there is an estimator of it; and what it follows.
-    of_law = scenario
-    if estimates_all(scenario, model):
+    of_law, estimator = scenario, scenario.estimator
+    if estimator is not None and estimates_all(scenario, model):
         of_law = estimating_all(scenario, model)
         try:
             law = tracking_law(of_law, completed_model(of_law)[1], structure)
         except (AssumptionError, ScenarioError) as error:  # No run is refused for it.
-            of_law = estimating_friction(scenario, model)
+            frictional = [c.friction_parameter for c in model.constraints if c.friction_parameter]
+            of_law = replace(scenario, estimator=replace(estimator, parameters=frictional))
             law = tracking_law(of_law, model, structure)
             text = "only friction of contacts is estimated, no loads, tilts and joints"
             notes = *notes, f"{text}: {error}"
@@ -281,54 +277,38 @@ class _NoController(TracedSystem, Controller):
     __slots__ = SHARED_DICTIONARY
 
     def __init__(self, structure: ConstraintStructure) -> None:
-        self._structure = structure
-        self.law = cast(TrackingLaw, _NoLaw(structure.system))
-        x = ca.SX.sym("x", structure.system.num_states)
+        self._structure, system = structure, structure.system
+        known = SimpleNamespace(system=system, structure=None, measured_force=None)
+        self.law = cast(TrackingLaw, known)
+        x = ca.SX.sym("x", system.num_states)
         super().__init__(Block("no_controller", {"estimated_state": x}, {"control": NOTHING}))
 
     @property
     def start_structure(self) -> ConstraintStructure:
         return self._structure
 
-    def check_plant(self, plant: Plant) -> None:
-        pass
-
     def derived(self, values: Mapping[str, FloatArray]) -> Derived:
         none = np.zeros((*values["state"].shape[:-1], 0))
         return {name: (none, ()) for name in ("desired_output", "tracking_error")}
 
-    def predicted_error(
-        self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
-    ) -> FloatArray:
+    def predicted_error(self, times: FloatArray, *_: object) -> FloatArray:
         return np.zeros((times.size, 0))
-
-
-class _NoLaw:
-    """Has of a law what records ask for, its system; all else of a law is an error."""
-
-    structure = measured_force = None
-
-    def __init__(self, system: DaeSystem) -> None:
-        self.system = system
-
-    def __getattr__(self, name: str) -> Any:
-        text = f"robot.actuators is [], and there is no law with {name}; simulate runs it"
-        raise ModelError(text)
 
 
 def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
     """A scenario with a plant that rollouts support, and a remark if this changed the plant."""
-    plant = scenario.plant.rolled
-    if plant is scenario.plant:
+    given = scenario.plant
+    if not isinstance(given, MultibodyPlant) or given.contact_model != "point":
         return scenario, ""
     # Drake's contact has no viscous friction.
     viscous = [c.name for c in scenario.constraints if getattr(c, "viscous_friction", None)]
     none = {f"{name}.viscous_friction": 0.0 for name in viscous}
-    plant = replace(plant, parameters={**plant.parameters, **none})
+    numbers = {item.name: getattr(given, item.name) for item in fields(CompliantContact)}
+    plant = CompliantContact(**{**numbers, "parameters": {**given.parameters, **none}})
     return replace(scenario, plant=plant), (
-        f"a !{type(plant).__name__} runs in place of !{type(scenario.plant).__name__}: "
-        "the same equations of contact, traced. Drake's solver stops at a relative residual of "
-        "1e-6, and joints stop at their limits in Drake's plant alone"
+        "a !CompliantContact runs in place of !MultibodyPlant: the same equations of contact, "
+        "traced. Drake's solver stops at a relative residual of 1e-6, and joints stop at their "
+        "limits in Drake's plant alone"
     )
 
 
@@ -410,7 +390,7 @@ def build_commanded(scenario: Scenario) -> Commanded:
     if scenario.plant.carries:
         text = "Drake's hydroelastic contact cannot be traced: take a !CompliantContact instead"
         raise ScenarioError(("plant", text))
-    told, left_out = [f"Drake's plant: {remark}"] if remark else [], dict[str, str]()
+    left_out = [f"Drake's plant: {remark}"] if remark else []
     robot, constraints, exogenous = scenario.robot, scenario.constraints, {**scenario.exogenous}
 
     # Friction of the plant: a coefficient of 0 for frictionless contacts. A compliant contact has
@@ -420,15 +400,19 @@ def build_commanded(scenario: Scenario) -> Commanded:
         points = []
     bare = [point for point in points if point.friction is None]
     if bare and scenario.actuation:
-        left_out[_ROUGH] = "the law would differentiate it; give the constraint a friction"
+        left_out.append(
+            "friction of the plant: none, since the law would differentiate it; give the "
+            "constraint a friction"
+        )
     else:
         constraints = [replace(c, friction=0.0) if c in bare else c for c in constraints]
 
     # Surfaces that are dragged: their places are constant exogenous signals.
     if points and scenario.estimator is not None:
-        left_out[_DRAGGED] = (
-            "an estimator does not know how a surface moves, and an ideal contact needs a law that "
-            "does; with `plant: !CompliantContact` they are dragged"
+        left_out.append(
+            "surfaces that are dragged: none, since an estimator does not know how a surface "
+            "moves, and an ideal contact needs a law that does; with `plant: !CompliantContact` "
+            "they are dragged"
         )
     else:
         for place in (point.parameters[0] for point in points):
@@ -442,12 +426,7 @@ def build_commanded(scenario: Scenario) -> Commanded:
             pushes.append(KnownWrench(name, name=PUSH + name))
     robot = replace(robot, known_forces=[*robot.known_forces, *pushes])
     extended = replace(scenario, robot=robot, constraints=constraints, exogenous=exogenous)
-    reasons = [f"{name}: none, since {reason}" for name, reason in left_out.items()]
-    try:
-        completed, loop = build_completed(extended, commanded=True)
-    except DrakeDaeError as error:
-        completed, loop = build_completed(scenario, commanded=True)  # Its own errors come first.
-        reasons = [f"{name}: {error}" for name in (_ROUGH, _DRAGGED, "links that are pushed")]
+    completed, loop = build_completed(extended, commanded=True)
     # The original exogenous signals decide whether the loop starts at rest.
     initial = replace(completed.scenario, exogenous=scenario.exogenous)
-    return Commanded(loop, start_scenario(initial, loop), (*told, *reasons))
+    return Commanded(loop, start_scenario(initial, loop), tuple(left_out))

@@ -13,7 +13,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError, ScenarioError
-from drake_dae.references import Reference
+from drake_dae.references import ConstantReference, Reference
 from drake_dae.references.by_name import denoted
 from drake_dae.robots import (
     LETTERS,
@@ -98,7 +98,13 @@ def completions(
             quality = search.least_quality(posture, [*named, *added], enough)
             found.append(((quality > 0.0, count, quality), posture, added))
     if not found:
-        raise ScenarioError(search.why_none(starts[0]))
+        steered = ", ".join([*search.names(named), *search.forces]) or "the constraints"
+        text = (
+            f"{search.missing} outputs are missing, one for each actuator that is left, and no "
+            f"positions of joints beside {steered} leave B(x) of (16) regular at the start. Name "
+            "others, leave out what depends on others, or leave actuators out by robot.actuators"
+        )
+        raise ScenarioError(("outputs or forces", text))
     # Of those that are equal along the reference, the best one at the start.
     found.sort(key=lambda entry: entry[0], reverse=True)
     fewer = [entry for entry in found[MOST:] if entry[0][1] < found[0][0][1]]
@@ -111,14 +117,15 @@ class _Search:
 
     `tilts` are zero where tools are normal to their surfaces; `axes` are the rows of the tools'
     directions that may be outputs, by `tool_axis`. `named` are the rows to which references refer,
-    and `path` their values and rates at some times, of which `begin` are the first values.
+    and `path` their values at some times, of which `begin` are the first.
     """
 
     def __init__(self, scenario: Scenario, links: Links, constraints: Sequence[Constraint]) -> None:
         self._scenario, self._links = scenario, links
         self._bound = ConstraintSet([*constraints, *plant_constraints(links)])
-        steered = as_force_outputs(scenario.forces, self._bound)
-        self._forces = [s.name for output in steered for s in output.signals(self._bound)]
+        with at("forces"):
+            steered = as_force_outputs(scenario.forces, self._bound)
+        self.forces = [s.name for output in steered for s in output.signals(self._bound)]
         self._S = force_rows(steered, self._bound, links)
         self._signals, self._expressions = list[Signal](), list[ca.SX]()
         # Of each row its output, the attribute that holds its rows, and the first of them.
@@ -128,7 +135,7 @@ class _Search:
         self._given = len(self._signals)
         controls = len(links.actuator_signals) + len(self._bound.motors)
         self.missing = controls - self._given - self._S.shape[0]
-        self.is_controlled = self._given or self._forces or scenario.references or scenario.task
+        self.is_controlled = self._given or self.forces or scenario.references or scenario.task
         touches = {c.name: c.touch(links) for c in self._bound.constraints}
         self._touches = {name: touch for name, touch in touches.items() if touch is not None}
         taken, kind = {signal.name for signal in self._signals}, scenario.tool_axis
@@ -168,7 +175,7 @@ class _Search:
         values = {name: np.atleast_1d(value) for name, value in scenario.plant.parameters.items()}
         for name, references in scenario.exogenous.items():
             parts = [_values_of(r, getattr(r, "size", 1)) for r in references]
-            at_start = [part(scenario.integrator.start_time)[:, 0] for part in parts]
+            at_start = [part(scenario.integrator.start_time) for part in parts]
             values[name] = np.concatenate([np.zeros(0), *at_start])
         rows = ca.vertcat(ca.SX(0, 1), *self._expressions)
         touches = list(zip(self._touches.values(), self._outward, strict=True))
@@ -190,7 +197,7 @@ class _Search:
         key, references = "references", scenario.references
         if scenario.task is not None:
             key, references = "task.phases", self._of_phases()
-        known = list[tuple[_Values, list[int | None]]]()
+        known = list[tuple[Callable[[float], FloatArray], list[int | None]]]()
         for name, reference in references.items():
             at_key, rows = f"{key}.{name}", list[int | None]()
             for part in map(str.strip, name.split(",")):
@@ -203,20 +210,18 @@ class _Search:
         more = [row for row in every if row >= self._given]
         if len(more) > self.missing:
             text = f"are {len(more)} outputs, but only {self.missing} are missing"
-            raise ScenarioError((key, f"{self._names(more)} {text}"))
+            raise ScenarioError((key, f"{', '.join(self.names(more))} {text}"))
         left = [row for row in range(self._given) if row not in every]
         if left and scenario.task is None:
-            raise ScenarioError((key, f"missing: {self._names(left)}"))
+            raise ScenarioError((key, f"missing: {', '.join(self.names(left))}"))
         self.named, self._room = [*range(self._given), *more], self.missing - len(more)
 
         def values_at(time: float) -> FloatArray:
-            values = np.column_stack(
-                [near.rows, np.zeros_like(near.rows)]
-            )  # If nothing refers to them.
+            values = near.rows.copy()  # Those that nothing refers to stay.
             for function, rows in known:
-                for row, pair in zip(rows, function(time), strict=True):
+                for row, value in zip(rows, function(time), strict=True):
                     if row is not None:
-                        values[row] = pair
+                        values[row] = value
             return values[self.named]
 
         begin = scenario.integrator.start_time
@@ -224,10 +229,10 @@ class _Search:
         self.path = [values_at(time) for time in np.unique(np.linspace(begin, end, _TIMES))]
         errors = scenario.start.errors
         off = [errors.get(self._signals[row].name, 0.0) for row in self.named]
-        self.begin = self.path[0][:, 0] + off
+        self.begin = self.path[0] + off
 
-    def _names(self, rows: Sequence[int]) -> str:
-        return ", ".join(self._signals[row].name for row in rows)
+    def names(self, rows: Sequence[int]) -> list[str]:
+        return [self._signals[row].name for row in rows]
 
     def _of_phases(self) -> dict[str, Any]:
         """The first reference that a phase of the task gives each output, without distances."""
@@ -245,7 +250,7 @@ class _Search:
 
     def _denoted(self, name: str, key: str, along: Sequence[int]) -> Sequence[int | None]:
         """The rows that a name in references denotes; None for a force."""
-        signals, forces = [signal.name for signal in self._signals], self._forces
+        signals, forces = [signal.name for signal in self._signals], self.forces
         outputs = [*signals[: self._given], *forces]
         with suppress(ReferenceSignalError):
             places = denoted(name, outputs, [2] * self._given + [0] * len(forces))
@@ -298,18 +303,10 @@ class _Search:
                     found.append(postures.at(q))
             if found:
                 return sorted(found, key=lambda p: -postures.quality(p, named))
-        q, residual = postures.nearest(named, begin, guesses)
-        polished = postures.solve(named, begin, q)
-        if polished is not None:
-            return [postures.at(polished)]
-        missed = [f"{residual:.2g} (m or rad) is left of the constraints"] * (residual > 1e-6)
-        for row, value, goal in zip(named, postures.at(q).rows[named], begin, strict=True):
-            name, unit = self._signals[row].name, self._signals[row].unit
-            text = f"{name} comes to {value:.4g} {unit}, and not to {goal:.4g} {unit}"
-            missed += [text] * bool(abs(goal - value) > 1e-6)
+        goals = (f"{name} = {v:.4g}" for name, v in zip(self.names(named), begin, strict=True))
         text = (
-            "the robot cannot start there within its joint limits; the nearest start found has: "
-            f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "
+            "no start was found on the constraints and within joint limits with "
+            f"{', '.join(goals) or 'these constraints'}. Change the first values of the "
             "references, start.errors or the surface's place, or give start.positions"
         )
         key = "references" if self._scenario.task is None else "task.phases"
@@ -350,26 +347,21 @@ class _Search:
 
         A value below `enough` need not be exact.
         """
-        postures, least = self.postures, self.postures.quality(posture, rows)
-        for now, rates in self._followed(posture, rows):
-            if now is None:
-                return 0.0
-            least = min(least, postures.quality(now, rows))
-            if least <= enough or postures.is_too_fast(now, rows, rates):
-                return min(least, enough) if least else 0.0
+        least = self.postures.quality(posture, rows)
+        for now in self._followed(posture, rows):
+            least = 0.0 if now is None else min(least, self.postures.quality(now, rows))
+            if least <= enough:
+                break
         return least
 
-    def _followed(
-        self, posture: Posture, rows: Sequence[int]
-    ) -> Iterator[tuple[Posture | None, FloatArray]]:
-        """The posture at each time of the references, None out of reach; and the rates of rows."""
-        wanted, count, q = posture.rows[list(rows)], len(self.named), posture.q
-        for values, rates in map(np.transpose, self.path):
-            wanted[:count] = values
+    def _followed(self, posture: Posture, rows: Sequence[int]) -> Iterator[Posture | None]:
+        """The posture at each time of the references; None where they are out of reach."""
+        wanted, q = posture.rows[list(rows)], posture.q
+        for values in self.path:
+            wanted[: len(self.named)] = values
             found = self.postures.solve(rows, wanted, q)
             q = posture.q if found is None else found
-            now = None if found is None else self.postures.at(q)
-            yield now, np.concatenate([rates, np.zeros(len(rows) - count)])
+            yield None if found is None else self.postures.at(q)
 
     def written(self, posture: Posture, added: Sequence[int]) -> Completed:
         """The scenario with outputs, references and start, and notes."""
@@ -378,7 +370,7 @@ class _Search:
             joints = " (joints so that B(x) is best conditioned)" * bool({*added} & {*self.joints})
             is_free = self._axes and not {*held} & {*self._axes}
             left = "; the tool's axis is left free" * bool(is_free)
-            notes.append(f"outputs completed by {self._names(chosen)}{joints}{left}")
+            notes.append(f"outputs completed by {', '.join(self.names(chosen))}{joints}{left}")
             outputs = [*scenario.outputs]
             for (form, key, begin), rows in groupby(chosen, lambda row: self._forms[row]):
                 part = getattr(form, key)
@@ -409,20 +401,18 @@ class _Search:
         texts = (f"{name}: {value:.4g}" for name, value in positions.items())
         notes.append(f"start found: {{{', '.join(texts)}}}")
         scenario = replace(scenario, start=replace(scenario.start, positions=positions))
-        followed = [now for now, _ in self._followed(posture, held) if now is not None]
+        followed = [now for now in self._followed(posture, held) if now is not None]
         points = enumerate(self._points)
         critical = [now.critical_friction(*point) for point in points for now in followed]
         return Completed(scenario, tuple(notes), min(critical, default=np.inf))
 
     def _off_surface(self, touching: Posture, held: Sequence[int]) -> FloatArray:
         """The configuration with the same outputs, `BEFORE` the surface of a task."""
-        scenario = self._scenario
-        assert scenario.task is not None
-        contact = scenario.task.contact
-        values = {p.name: p.value for p in self._bound.parameters}
-        values |= {name: np.atleast_1d(v) for name, v in scenario.plant.parameters.items()}
+        assert self._scenario.task is not None
+        contact = self._scenario.task.contact
+        values = {p.name: p.value for p in self._bound.parameters} | self._scenario.plant.parameters
         moved = {
-            f"{name}.position": values[f"{name}.position"] + BEFORE * normal
+            f"{name}.position": np.add(values[f"{name}.position"], BEFORE * normal)
             for name, normal in zip(self._touches, touching.normals, strict=True)
             if f"{name}.position" in values and contact in (name, "")
         }
@@ -432,51 +422,15 @@ class _Search:
             raise ScenarioError(("start.positions", text))
         return q
 
-    def why_none(self, posture: Posture) -> tuple[str, str]:
-        """The key and text of the problem if no positions complete the outputs."""
-        forces, needed = self._forces, self._given + self.missing
-        left, values, _ = np.linalg.svd(posture.forces)
-        rank = int(np.count_nonzero(values > 1e-6 * np.max(values, initial=0.0)))
-        if rank < len(forces):
-            weights = np.linalg.norm(left[:, rank:], axis=1)
-            dependent = [name for name, w in zip(forces, weights, strict=True) if w > 1e-6]
-            return "forces", (
-                f"{', '.join(dependent)} depend on each other at the start: of {len(forces)} force "
-                f"outputs {rank} are independent. Leave out {len(forces) - rank} of them; a force "
-                "across several contacts of one plane is a !ForceCombination of those normal to it"
-            )
-        ways = len(posture.mass) - int(np.linalg.matrix_rank(posture.constraints, 1e-9))
-        if needed <= ways:
-            named = self._names(self.named) or "the constraints"
-            return "outputs", (
-                f"{self.missing} are missing, and no positions of joints beside {named} leave B(x) "
-                "regular; name others under outputs"
-            )
-        possible = ", ".join(signal.name for signal in self._bound.force_signals)
-        return "forces", (
-            f"{needed} outputs more are needed, one for each actuator that is left, but on its "
-            f"constraints the robot moves in {ways} ways: at most {ways} can be positions, and "
-            f"{needed - ways} more must be forces, of {possible}; or leave actuators out by "
-            "robot.actuators"
-        )
-
 
 def _rounded(values: FloatArray) -> FloatArray:
     """Values in m and rad as they are written, without -0."""
     return np.round(values, 4) + 0.0
 
 
-_Values = Callable[[float], FloatArray]
-
-
-def _values_of(reference: Any, size: int) -> _Values:
-    """The values of a reference and their rates as a function of time in s, shape (size, 2)."""
+def _values_of(reference: Any, size: int) -> Callable[[float], FloatArray]:
+    """The values of a reference, or of a number, as a function of time in s, shape (size,)."""
     if not isinstance(reference, Reference):
-        constant = np.array([[float(reference), 0.0]] * size)
-        return lambda time: constant
-    try:
-        function = reference.derivatives([1] * size)
-        return lambda time: function(time).reshape(-1, 2)
-    except ReferenceSignalError:  # One of a force may jump.
-        values = reference.derivatives([0] * size)
-        return lambda time: values(time)[:, None] * [1.0, 0.0]
+        reference = ConstantReference([reference] * size)
+    values: Callable[[float], FloatArray] = reference.derivatives([0] * size)
+    return values

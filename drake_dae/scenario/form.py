@@ -418,31 +418,30 @@ def _error(problem: str, node: yaml.Node) -> yaml.MarkedYAMLError:
     return yaml.constructor.ConstructorError(problem=problem, problem_mark=node.start_mark)
 
 
-def _count(node: yaml.Node, counts: dict[int, int]) -> int:
-    """The number of values of a node, whose keys and texts are checked."""
-    if id(node) in counts:
-        return counts[id(node)]
-    counts[id(node)] = MOST_VALUES  # For an alias inside itself.
-    parts, names = node.value, set[str]()
-    if isinstance(node, yaml.ScalarNode):
-        parts = []
-        if not can_be_written(node.value):
-            text = "the text has half of a letter (\\ud800 to \\udfff), which no file can hold"
-            raise _error(text, node)
-    elif isinstance(node, yaml.MappingNode):
-        for key, _ in node.value:
-            if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
-                name = brief(key.value) if isinstance(key, yaml.ScalarNode) else "of a mapping"
-                raise _error(f"the key {name} is not text; quote it", key)
-            if key.value in names:
-                raise _error(f"the key '{key.value}' is given twice", key)
-            names.add(key.value)
-        parts = [part for pair in node.value for part in pair]
-    count = counts[id(node)] = 1 + sum(_count(part, counts) for part in parts)
-    if count > MOST_VALUES:
+def _walk(node: yaml.Node, key: str, line: int, lines: dict[str, int]) -> None:
+    """Notes the line of each dotted key, and checks keys and texts."""
+    if len(lines) >= MOST_VALUES:
         text = f"more than {MOST_VALUES} values, counting aliases as often as they are used"
         raise _error(text, node)
-    return count
+    lines[key], parts, names = line, list[tuple[str, yaml.Node, yaml.Node]](), set[str]()
+    if isinstance(node, yaml.SequenceNode):
+        parts = [(str(index), part, part) for index, part in enumerate(node.value)]
+    for name, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+        if name.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
+            shown = brief(name.value) if isinstance(name, yaml.ScalarNode) else "of a mapping"
+            raise _error(f"the key {shown} is not text; quote it", name)
+        if name.value in names:
+            raise _error(f"the key '{name.value}' is given twice", name)
+        names.add(name.value)
+    if isinstance(node, yaml.MappingNode):
+        parts = [(name.value, name, part) for name, part in node.value]
+    for text in [*names, node.value if isinstance(node, yaml.ScalarNode) else ""]:
+        if not can_be_written(text):
+            problem = "the text has half of a letter (\\ud800 to \\udfff), which no file can hold"
+            raise _error(problem, node)
+    for part_name, start, part in parts:
+        below = f"{key}.{part_name}" if key else part_name
+        _walk(part, below, start.start_mark.line + 1, lines)
 
 
 def load_yaml(text: str, name: str) -> Any:
@@ -459,8 +458,8 @@ def load_lines(text: str, name: str) -> tuple[Any, Callable[[str], int | None]]:
         loader = _Loader(text)
         node = loader.get_single_node()
         if node is not None:
-            _count(node, {})
-            data, lines = loader.construct_document(node), dict(_lines(node, node, ""))
+            _walk(node, "", node.start_mark.line + 1, lines)
+            data = loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         problem = ", ".join(part for part in (error.context, error.problem) if part)
@@ -475,18 +474,6 @@ def load_lines(text: str, name: str) -> tuple[Any, Callable[[str], int | None]]:
         # Of PyYAML, where a tag such as !!int or !!timestamp has a value that is none.
         raise ScenarioError((name, "a tag of YAML (!!...) does not fit its value")) from None
     return data, lines.get
-
-
-def _lines(place: yaml.Node, node: yaml.Node, key: str) -> Iterator[tuple[str, int]]:
-    """The dotted keys of a node at its place in the text, and the line of each."""
-    yield key, place.start_mark.line + 1
-    parts = []
-    if isinstance(node, yaml.SequenceNode):
-        parts = [(str(index), part, part) for index, part in enumerate(node.value)]
-    elif isinstance(node, yaml.MappingNode):
-        parts = [(name.value, name, part) for name, part in node.value]
-    for name, start, part in parts:
-        yield from _lines(start, part, f"{key}.{name}" if key else name)
 
 
 def first_name(names: Iterable[str], key: str) -> str | None:

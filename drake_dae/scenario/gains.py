@@ -20,15 +20,14 @@ from drake_dae.dae import (
 )
 from drake_dae.dae.advised_gains import EVERY, MODEL_ERROR, RAMP, Part, settles_along
 from drake_dae.dae.law_model import damping_gains
-from drake_dae.dae.margins import ContactMargins
 from drake_dae.dae.one_direction import DirectionGains
-from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import JointFriction, Plane, PointOnSurface, RobotModel, velocities_are_rates
 from drake_dae.scenario import parts
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at
-from drake_dae.scenario.model import motion_along, references_of
+from drake_dae.scenario.model import references_of
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario, WrittenConstraint
@@ -48,9 +47,6 @@ _EFFORT = 100.0  # The largest effort in N m of drives without limits in the fil
 _LOAD, _CENTER, _TILT, _PLACE, _COULOMB, _VISCOUS = 0.2, 0.2, 0.15, 0.01, 0.1, 0.25
 PATCH_FORCE = 10.0  # The force in N at which the stiffness of a hydroelastic patch is evaluated.
 _PERIODS = 3  # The oscillations of the contact after the force of a touch has reached its goal.
-# The number of states along the references at which friction is compared with what jams; and the
-# factor of their velocities, so that friction of the model is that of a contact that slides.
-_STATES, _DEVELOPED = 33, 10.0
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
@@ -114,7 +110,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         estimator = replace(estimator, parameters=frictional)
 
     # The task: soft along the distance while the contact is open, see `TaskController`.
-    task, touch_note = scenario.task, ""
+    task = scenario.task
     if task is not None:
         if task.gains is None:
             free = {signal.name: contact.position_gains(2) for signal in model.position_signals}
@@ -122,8 +118,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             distance = opening_contact(scenario, model).residual_signals[0].name
             free[distance] = [rate**2, 2.0 * rate]
             task = replace(task, gains=_coefficients(free))
-        acting = least_damping(structure, damping), contact.force_gain, period, period * (1 + late)
-        task, touch_note = with_lasting_touches(task, stiffness, mobility, *acting)
+        acting = least_damping(structure, damping), contact.force_gain, period, late
+        task = with_lasting_touches(task, stiffness, mobility, *acting)
     chosen = replace(
         scenario,
         task=task,
@@ -144,9 +140,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     stated, named = stated_errors(chosen, model, structure), estimator.parameters
     identified = ", ".join(name for name in named or () if name in frictional) or "none"
     if named is None:
-        identified = "friction, loads, tilts and places of planes"
-        if scenario.compliances is not None:
-            identified = "friction and loads"
+        planes = ", tilts and places of planes" * (scenario.compliances is None)
+        identified = f"friction, loads{planes}"
     shape = "Butterworth's" if contact.position_damping < 0.75 else "equal"
     estimated = "" if fast is None else f", and an estimate of the state of {rounded(fast):g} 1/s"
     note = (
@@ -156,10 +151,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"{-rounded(contact.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
         f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an estimator of "
         f"{estimator.rate:g} 1/s that identifies: {identified}{estimated}"
-        f"{outlook}{f'. {expected(chosen, stated)}' if stated else ''}{touch_note}"
+        f"{outlook}{f'. {expected(chosen, stated)}' if stated else ''}"
     )
-    told = note, jam(scenario, model, structure, material.friction)
-    return Completed(chosen, tuple(filter(None, told)))
+    return Completed(chosen, (note,))
 
 
 def _coefficients(gains: Mapping[str, Sequence[float]]) -> parts.Coefficients:
@@ -170,15 +164,13 @@ def _sensed_gains(
     scenario: Scenario, model: RobotModel, structure: Structure, stiffness: float
 ) -> tuple[AdvisedGains, str]:
     """The gains for a contact and encoders, and what is predicted for them, in words."""
-    law = scenario.law
+    law, bare = scenario.law, ""
     sensed = sensed_contact(scenario, model, structure, stiffness)
-    roughness = law.largest_roughness
-    if roughness is None:
-        efforts = model.control_limits[np.isfinite(model.control_limits)]
-        roughness = _SHARE * float(np.max(efforts)) if efforts.size else 1.0
+    efforts = model.control_limits[np.isfinite(model.control_limits)]
+    roughness = law.largest_roughness or _SHARE * float(np.max(efforts, initial=0.0)) or 1.0
     bounds = {} if law.largest_errors is None else vars(law.largest_errors)
     errors = {f"{name}_error": most for name, most in bounds.items() if most is not None}
-    bare, softer = "", sensed
+    softer = sensed
     if not settles_along(sensed):
         # Gains of the stiffest softer contact that has some: they are stable up to twice that, and
         # slow beside the oscillation of a stiffer one, which its own dissipation damps.
@@ -191,8 +183,8 @@ def _sensed_gains(
     best = advised_gains(softer, roughness, **errors)
     return best, (
         ". These gains are the best for one direction alone, "
-        f"{1e3 * best.noise_error:.2g} mm and {best.noise_force:.2g} N rms by noise, and a change "
-        f"of the controls of {best.roughness:.2g} N m from sample to sample{bare}"
+        f"{1e3 * best.free.by_noise:.2g} mm and {best.contact.by_noise:.2g} N rms by noise, and a "
+        f"change of the controls of {best.roughness:.2g} N m from sample to sample{bare}"
     )
 
 
@@ -223,13 +215,6 @@ def estimates_all(scenario: Scenario, model: RobotModel) -> bool:
     is_plain = all(isinstance(surface, Plane) for surface in surfaces)  # On a sphere it got worse.
     is_rigid = not model.stages and velocities_are_rates(model.links)
     return is_plain and is_rigid and not scenario.exogenous
-
-
-def estimating_friction(scenario: Scenario, model: RobotModel) -> Scenario:
-    """The scenario of a law whose estimator knows the friction of contacts that have it."""
-    assert scenario.estimator is not None
-    names = [c.friction_parameter for c in model.constraints if c.friction_parameter]
-    return replace(scenario, estimator=replace(scenario.estimator, parameters=names))
 
 
 def estimating_all(scenario: Scenario, model: RobotModel) -> Scenario:
@@ -393,46 +378,16 @@ def least_damping(structure: Structure, damping: parts.Gains | None) -> float:
         return float(np.min(np.diag(damping_gains(structure, damping.design()).matrix)))
 
 
-def jam(scenario: Scenario, model: RobotModel, structure: Structure, friction: float | None) -> str:
-    """Where friction of the plant makes contacts jam along the references, as a sentence.
-
-    Along a normal that hardly moves, friction that the law does not know may move the tool into
-    the surface by more than the normal force moves it out: mu A_nt > A_nn, the Painleve paradox.
-    """
-    system = model.dae
-    if scenario.task is not None or not (system.frictional_contacts and friction):
-        return ""
-    try:
-        motion = motion_along(scenario, model, structure, _STATES)
-    except DrakeDaeError:  # Wrong references and starts are reported where they are used.
-        return ""
-    if not motion.times.size:
-        return ""
-    states = motion.states.copy()
-    states[:, model.links.q.numel() :] *= _DEVELOPED
-    margins = ContactMargins(system, structure.elimination.constraint_matrix)
-    margin = margins.along(motion.times, states, motion.parameters)
-    if not margin.lowest <= friction:
-        return ""
-    name = max(margin.critical_friction, key=margin.critical_friction.__getitem__)
-    return (
-        f"no gains are stable here: with {name} of {margin.lowest:.2g} or more the contact jams at "
-        f"t = {margin.time:.3g} s (the Painleve paradox: friction presses the tool on by more than "
-        f"the surface presses it back), and the plant has {friction:g}; start in a posture from "
-        "which the tool moves more easily along the normal, or reduce the friction"
-    )
-
-
 def with_lasting_touches(
     task: ScenarioTask,
-    stiffness: float,
-    mobility: float,
+    k: float,
+    A: float,
     damping: float,
     force_gain: float,
     period: float,
-    late: float,
-) -> tuple[ScenarioTask, str]:
-    """The task whose touches do not open again, and a sentence on their largest expected force.
+    late: int,
+) -> ScenarioTask:
+    """The task whose touches do not open again.
 
     The law holds for each sample T the force
 
@@ -441,16 +396,13 @@ def with_lasting_touches(
     with the depth d, and the reference lambda that fades from the felt force to the goal. F is
     linear in the speed v of a touch, F = F_lambda(t) + v F_v(t), so that the largest v is the least
     F_lambda / -F_v of all times with F_v < 0. An Approach without a speed has this one, or its
-    default if that is lower. The largest force is F + v (sqrt(k / A) + k t): the contact stops the
-    mass 1 / A of the tool, which moves on for the time t until the law reacts.
+    default if that is lower.
     """
-    k, A = stiffness, mobility
     step = expm(period * np.array([[0.0, 1.0, 0.0], [-A * k, 0.0, A], [0.0, 0.0, 0.0]]))
 
     def force(depth: float, rate: float, reference: FloatArray) -> FloatArray:
         """F at each sample after a touch."""
-        waiting = [k * depth] * (round(late / period) - 1)
-        integral, forces = 0.0, np.empty(reference.size)
+        waiting, integral, forces = [k * depth] * late, 0.0, np.empty(reference.size)
         for index, wanted in enumerate(reference.tolist()):
             forces[index] = felt = k * depth
             waiting.append(wanted + force_gain * integral - damping * rate / A)
@@ -472,13 +424,4 @@ def with_lasting_touches(
             lasting = np.min(of_reference[opens] / -of_speed[opens], initial=inf)
             speed = min(speed, float(lasting))
         phases[index] = replace(phase, speed=rounded(speed))
-    task = replace(task, phases=phases)
-    reach = (k / A) ** 0.5 + k * late
-    approaches = [phase for phase in task.make().phases if isinstance(phase, Approach)]
-    peaks = [(p.felt(felt) + p.speed_of_approach * reach, p) for p in approaches]
-    if not peaks:
-        return task, ""
-    peak, phase = max(peaks, key=lambda pair: (pair[0], pair[1].speed_of_approach, pair[1].name))
-    which = f" by {phase.name}" if len(peaks) > 1 else ""
-    speed = phase.speed_of_approach
-    return task, f". A touch{which} at {speed:g} m/s is expected to stay below {peak:.3g} N"
+    return replace(task, phases=phases)

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context
 from drake_dae import analysis as theory
 from drake_dae.analysis import LimitKind, LimitsAlong, SignalRange
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import Signal, Structure, ZeroDynamics, find_structure
+from drake_dae.dae import Signal, Structure
 from drake_dae.dae.advised_gains import RAMP
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
@@ -39,9 +39,8 @@ from drake_dae.scenario.model import (
 )
 from drake_dae.scenario.scenario import Scenario
 
-# The least number of examined times along a reference, the most along a fast one, and the most of a
-# record at which its references are examined.
-SAMPLES, MOST_SAMPLES, MOST_TIMES = 1001, 20_000, 2000
+# The least number of examined times along a reference, and the most along a fast one.
+SAMPLES, MOST_SAMPLES = 1001, 20_000
 # The allowed deviation of a reference from linear interpolation between two times, relative to its
 # range; the shortest interval that is divided, relative to the whole; and the share of a run that
 # broke off, at its end, in which its limits are not judged.
@@ -215,8 +214,8 @@ def judge_run(
     """Judges a run by its record."""
     # What exceeds its limits, and which links are behind surfaces. The last numbers of a run that
     # broke off are not those of its motion.
-    wanted, remedies, notes = scenario.judgement, list[str](), list[str]()
-    model, law, goal = loop.plant.robot("a scenario"), loop.controller.law, loop.generator
+    wanted, notes = scenario.judgement, list[str]()
+    model, law = loop.plant.robot("a scenario"), loop.controller.law
     dae, times, stop = model.dae, record.time, record.time.size
     limits = theory.robot_limits(model, wanted.friction_cones)
     if failure:
@@ -226,17 +225,6 @@ def judge_run(
     for link in links_behind(model, times, record["state"], loop.plant_parameters(record, context)):
         numbers = Signal(link.link, "m"), link.depth, 0.0, link.time
         behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
-
-    # How much slower the references must be to keep the limits.
-    is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
-    if is_paced and goal is not None and not dae.exogenous.moving:
-        structure = law.structure if law.system is dae else find_structure(dae)
-        # The law's own degrees may be higher.
-        reference = stack_references(goal.references, structure.layout.reference_degrees)
-        some = times[:: times.size // MOST_TIMES + 1]
-        motion = ZeroDynamics(dae, structure=structure).motion(reference, some, record["state"][0])
-        found = theory.limits_along(structure, limits, reference, motion)
-        remedies.append("the references alone keep all limits" if found is None else found.remedy)
 
     # Approximations, and places beyond the data of surfaces.
     for constraint in model.constraints:
@@ -282,7 +270,6 @@ def judge_run(
         reasons=[reason for reason, holds in reasons.items() if holds],
         more=behind,
         statistics=statistics,
-        remedies=remedies,
         named=(scenario.estimator.parameters if scenario.estimator else None) or (),
     )
     notes.append(beyond_stated(scenario, model, law.structure, summary.outputs, record))
@@ -335,12 +322,10 @@ def _beyond_edge(
     constraint: Constraint, surface: Surface, model: RobotModel, record: Record
 ) -> str:
     """When a point is beyond the edge of its surface's data first; "" if it is not."""
-    dae, extent = model.dae, surface.extent
-    if extent is None:
+    dae, extent, coordinates = model.dae, surface.extent, constraint.coordinates(model.links)
+    # The record does not contain the position of a moving surface.
+    if extent is None or any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):
         return ""
-    coordinates = constraint.coordinates(model.links)
-    if any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):
-        return ""  # The record does not contain the position of a moving surface.
     function = dae.trace("coordinates", {"coordinates": coordinates})
     places = np.array([function(x, dae.parameter_values)[0] for x in record["state"]])
     beyond = np.max(np.maximum(extent[0] - places, places - extent[1]), axis=1)

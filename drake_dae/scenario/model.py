@@ -1,6 +1,5 @@
 """The robot model of a scenario, completed, and what its references demand of it."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
@@ -14,17 +13,18 @@ from drake_dae.analysis import robot_limits
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import DaeSystem, PinnedMotion, Structure, ZeroDynamics, find_structure
-from drake_dae.errors import (
-    AssumptionError,
-    DrakeDaeError,
-    GeometryWarning,
-    InconsistentStateError,
-    ScenarioError,
-)
+from drake_dae.errors import AssumptionError, DrakeDaeError, InconsistentStateError, ScenarioError
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.references.by_name import assign, in_order
 from drake_dae.references.reference import stack_references
-from drake_dae.robots import Constraint, Links, MultibodyExpressions, PositionOutput, RobotModel
+from drake_dae.robots import (
+    Constraint,
+    ForceOutput,
+    Links,
+    MultibodyExpressions,
+    PositionOutput,
+    RobotModel,
+)
 from drake_dae.scenario.completion import Completed, completions
 from drake_dae.scenario.form import at, each
 from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
@@ -35,9 +35,8 @@ from drake_dae.scenario.start import start_guess, start_state
 T = TypeVar("T")
 
 NOTHING_FOUND = "no start was found"  # So the note begins if none is good along the references.
-# At how many times a completed scenario is examined; the excess over a limit that counts, in its
-# unit; and the size of a surface in m above which its unit is doubtful.
-_TIMES, _SLACK, _LARGE = 201, 1e-6, 10.0
+# At how many times a completed scenario is examined, and the excess over a limit that counts.
+_TIMES, _SLACK = 201, 1e-6
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -107,26 +106,19 @@ def _checked_constraints(
     scenario: Scenario, links: MultibodyExpressions, loops: Sequence[Constraint]
 ) -> list[Constraint]:
     """The constraints, and a check of every key that the model takes, for errors with its place."""
-    robot, forces = scenario.robot, scenario.forces
+    robot, kinematics = scenario.robot, links.kinematics()
     constraints = each("constraints", scenario.constraints, lambda form: make(form, ()))
-    names = [constraint.name for constraint in (*robots.plant_constraints(links), *loops)]
+    of_file = (*loops, *robots.plant_constraints(links))
+    names = [constraint.name for constraint in of_file]
     for index, constraint in enumerate(constraints):
         with at(f"constraints.{index}"):  # Unknown names.
             if constraint.residual(links).numel() < len(constraint.force_signals):
-                constraint.rate(links.kinematics())
+                constraint.rate(kinematics)
         if not constraint.name or constraint.name in names:
             text = f"each constraint needs a name of its own, got '{constraint.name}'"
             raise ScenarioError((f"constraints.{index}.name", text))
         names.append(constraint.name)
-        extent = getattr(getattr(constraint, "surface", None), "extent", None)
-        if extent is not None and (size := np.max(extent[1] - extent[0])) > _LARGE:
-            text = (
-                f"the surface of '{constraint.name}' is {size:.3g} m long: if a unit of its file "
-                "is a millimetre, write scale: 0.001"
-            )
-            warnings.warn(text, GeometryWarning, stacklevel=2)
-    constraints += loops
-    bound = robots.ConstraintSet([*constraints, *robots.plant_constraints(links)])
+    bound = robots.ConstraintSet([*constraints, *of_file])
     actuators = (*links.actuator_signals, *bound.motors)
     if not actuators and robot.actuators != []:
         text = (
@@ -135,28 +127,25 @@ def _checked_constraints(
             "a URDF does by a <transmission>"
         )
         raise ScenarioError(("robot.actuators", text))
-    _outputs(scenario, constraints, links)
-    attached = list[Any]()
-    if links.actuator_signals:
-        attached = each("actuation", scenario.actuation, lambda stage: stage.attach(links))
-    with at("actuation"):
-        robots.chain(scenario.actuation, links)
-    read = each("forces", forces or (), lambda f: robots.as_force_outputs([f], bound))
-    each("forces", read, lambda f: robots.force_rows(f, bound, links))
-    with at("forces"):
-        robots.as_force_outputs(forces, bound)
+    _outputs(scenario, [*constraints, *loops], links)
+    attached = each("actuation", scenario.actuation, lambda stage: stage.attach(links))
+
+    def rows(force: str | ForceOutput) -> Any:
+        return robots.force_rows(robots.as_force_outputs([force], bound), bound, links)
+
+    each("forces", scenario.forces or (), rows)
     for force in scenario.compliances or {}:
         with at(f"compliances.{force}"):
             bound.place(force)
-    each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
+    each("robot.known_forces", robot.known_forces, lambda f: f.reaction(kinematics))
     with at("law.control_weights"):
         choice = robots.control_choice(scenario.law.control_weights or None, actuators)
-    parts: tuple[Any, ...] = (links, *constraints, *robot.known_forces, *attached)
+    parts: tuple[Any, ...] = (links, *constraints, *loops, *robot.known_forces, *attached)
     parameters = [p.name for p in (*choice, *(p for part in parts for p in part.parameters))]
     for moving in scenario.exogenous:
         if moving not in parameters:
             raise ScenarioError(("exogenous", unknown_name("parameter", moving, parameters)))
-    return constraints
+    return [*constraints, *loops]
 
 
 def _model(

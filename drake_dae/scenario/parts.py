@@ -2,8 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from importlib import import_module
+from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, cast
 
 import numpy as np
@@ -16,10 +15,10 @@ from pydrake.systems.framework import Context
 from drake_dae import systems
 from drake_dae.arrays import unknown_name
 from drake_dae.dae import ConstraintStructure, GainDesign, gain_coefficients, gain_matrices, poles
-from drake_dae.errors import DrakeDaeError, GainError, ModelError
+from drake_dae.errors import GainError, ModelError
 from drake_dae.references import Reference
 from drake_dae.robots import FrictionCone, RobotModel
-from drake_dae.scenario.form import Positive, at, expected
+from drake_dae.scenario.form import Positive, at
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Payload, Robot
 from drake_dae.systems import Observing, Plant, PointMaterial
@@ -42,8 +41,7 @@ class ScenarioPlant(ABC):
 
     carries: ClassVar[bool] = False
     """Whether the plant has these itself. Else a model has the payloads and disturbances, and
-    numbers are set in a context, or, if it does not adjust, the plant is made anew for each."""
-    adjusts: ClassVar[bool] = True
+    numbers are set in a context."""
     in_context: ClassVar[frozenset[str]] = frozenset()
     """The keys of numbers that `begin` sets in a context."""
 
@@ -51,11 +49,6 @@ class ScenarioPlant(ABC):
     def material(self) -> PointMaterial | None:
         """The material of contacts that give way."""
         return None
-
-    @property
-    def rolled(self) -> "ScenarioPlant":
-        """What a rollout runs: this, or what has a traced plant."""
-        return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
         """Sets the numbers of `in_context` in a context of the plant."""
@@ -77,10 +70,8 @@ class IdealConstraints(ScenarioPlant):
 class MultibodyPlant(systems.ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
-    A ball at the tool touches the surfaces of the constraints. With point contact the force is
-    stiffness times depth. With hydroelastic contact the ball is rigid, and the pressure of the
-    surface is modulus times depth / thickness. Where the tool tilts, the ball rolls, the farther
-    off ideal contact the larger its radius.
+    A ball at the tool touches the surfaces of the constraints. Where the tool tilts, it rolls, the
+    farther off ideal contact the larger its radius.
     """
 
     carries: ClassVar[bool] = True
@@ -88,13 +79,6 @@ class MultibodyPlant(systems.ContactMaterial, ScenarioPlant):
     @property
     def material(self) -> systems.ContactMaterial:
         return self
-
-    @property
-    def rolled(self) -> ScenarioPlant:
-        if self.contact_model != "point":
-            return self
-        names = [f.name for f in (*fields(PointMaterial), *fields(ScenarioPlant))]
-        return CompliantContact(**{name: getattr(self, name) for name in names})
 
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         def add(plant: DrakePlant, scene_graph: SceneGraph) -> None:
@@ -115,8 +99,7 @@ class MultibodyPlant(systems.ContactMaterial, ScenarioPlant):
 class CompliantContact(PointMaterial, ScenarioPlant):
     """The plant is a `CompliantPlant`: Drake's point contact as equations of this library.
 
-    It contains no MultibodyPlant, so rollouts are hundreds of times as fast as Drake's plant. It
-    supports what `!MultibodyPlant` does not: surfaces of any shape, moving surfaces, exogenous
+    It supports what `!MultibodyPlant` does not: surfaces of any shape, moving surfaces, exogenous
     signals, exports. It has no stops at the limits of joints. With a time_step of 0 it is
     continuous.
     """
@@ -136,42 +119,6 @@ class CompliantContact(PointMaterial, ScenarioPlant):
 
 
 @dataclass(frozen=True)
-class OwnPlant(ScenarioPlant):
-    """The plant is your own class that follows the contract of `drake_dae.Plant`.
-
-    It is called with the robot and its structure, as `maker(model, structure)`. Running such a
-    scenario imports the module, found by PYTHONPATH, also in the processes of a sweep: use only
-    files from people whose code you trust.
-
-    Attributes:
-        maker: The module and the class in it, as "my_plants:SpringyPlant".
-    """
-
-    maker: Annotated[
-        str,
-        Field(pattern=r"^[^:]+:[^\W\d]\w*$"),
-        expected("a module and a class in it, as my_plants:SpringyPlant"),
-    ]
-    adjusts: ClassVar[bool] = False
-
-    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
-        module, _, name = self.maker.partition(":")
-        with at("plant.maker"):
-            try:
-                plant = getattr(import_module(module), name)(model, structure)
-            except DrakeDaeError:
-                raise
-            except Exception as error:
-                what = f"{type(error).__name__}: {error}"
-                raise ModelError(f"'{self.maker}' cannot be loaded and made: {what}") from error
-            if not isinstance(plant, Plant):
-                raise ModelError(
-                    f"'{self.maker}' makes no plant that keeps the contract of drake_dae.Plant"
-                )
-            return plant
-
-
-@dataclass(frozen=True)
 class MeasuredForce:
     """The law uses the constraint force that a `ForceSensor` measures: (59), (71), (81).
 
@@ -182,8 +129,7 @@ class MeasuredForce:
         noise_deviation: The standard deviation of the noise in N or N m, one number for all forces
             or one per force.
         drift: The rate at which the bias changes, in N/s or N m/s, one number for all forces or one
-            per force. No law and no estimator knows it; a task subtracts the bias that it finds
-            within `tare_time`, and feels what the drift adds from then on.
+            per force; nothing estimates it.
         seed: The seed of the noise.
     """
 

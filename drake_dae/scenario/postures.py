@@ -140,7 +140,6 @@ class Postures:
             sized.append(np.broadcast_to(value, (p.value.size,)))
         self._parameters = np.concatenate(sized)
         self.low, self.high = links.position_limits
-        _, self._fastest = links.velocity_limits
         self._turns = np.array([signal.unit == "rad" for signal in links.position_signals])
         places = ca.Function("places", [*inputs.values()], [links.landmarks()])
         points = places(links.default_positions, self._parameters).full()
@@ -158,38 +157,6 @@ class Postures:
         self, rows: Sequence[int], wanted: FloatArray, guess: FloatArray
     ) -> FloatArray | None:
         """A configuration on the constraints in which some rows have given values, near a guess."""
-        residual, slopes = self._residual(rows, wanted)
-        q = newton(guess, lambda q: shortest_steps(slopes(q), residual), _NEWTON_STEPS)[0]
-        is_fine = (self._room(q) >= 0.0) & np.isfinite(self.high - self.low)
-        near = unwound(q, np.zeros(q.size), (self.low, self.high), self._turns & ~is_fine)
-        for found in (near, q):  # Where a row is the position of a joint, turns matter.
-            left = np.max(np.abs(residual(found)), initial=0.0)
-            if left < _EXACT and np.all(self._room(found) >= -_EXACT):
-                return found
-        return None
-
-    def nearest(
-        self, rows: Sequence[int], wanted: FloatArray, guesses: Iterable[FloatArray]
-    ) -> tuple[FloatArray, float]:
-        """The configuration within limits nearest to given values, and what constraints miss."""
-        from scipy.optimize import least_squares  # Imported here, since few runs need it.
-
-        residual, slopes = self._residual(rows, wanted)
-        weights = np.concatenate([np.full(self._count, 100.0), np.ones(len(rows))])
-        low, high = self.low, np.maximum(self.high, self.low + 1e-6)
-
-        def weighted(q: FloatArray) -> FloatArray:
-            return np.nan_to_num(weights * residual(q), nan=1e6, posinf=1e6, neginf=-1e6)
-
-        inside = [np.clip(q, low, high) for q in guesses]
-        tried = sorted(inside, key=lambda q: float(np.sum(weighted(q) ** 2)))[:3]
-        gradient, bounds = lambda q: weights[:, None] * slopes(q), (low, high)
-        fits = [least_squares(weighted, q, gradient, bounds, max_nfev=50) for q in tried]
-        q = min(fits, key=lambda fit: float(fit.cost)).x
-        return q, float(np.max(np.abs(residual(q)[: self._count]), initial=0.0))
-
-    def _residual(self, rows: Sequence[int], wanted: FloatArray):  # type: ignore[no-untyped-def]
-        """The equations of `solve`, shape (k + len(rows),), and their slopes."""
         chosen = np.concatenate([np.arange(self._count), self._count + np.array(rows, dtype=int)])
         goal, parameters = np.concatenate([np.zeros(self._count), wanted]), self._parameters
 
@@ -199,7 +166,14 @@ class Postures:
         def slopes(q: FloatArray) -> FloatArray:
             return self._slopes.evaluate(q, parameters)[0].reshape(-1, q.size)[chosen]
 
-        return residual, slopes
+        q = newton(guess, lambda q: shortest_steps(slopes(q), residual), _NEWTON_STEPS)[0]
+        is_fine = (self._room(q) >= 0.0) & np.isfinite(self.high - self.low)
+        near = unwound(q, np.zeros(q.size), (self.low, self.high), self._turns & ~is_fine)
+        for found in (near, q):  # Where a row is the position of a joint, turns matter.
+            left = np.max(np.abs(residual(found)), initial=0.0)
+            if left < _EXACT and np.all(self._room(found) >= -_EXACT):
+                return found
+        return None
 
     def _room(self, q: FloatArray) -> FloatArray:
         """The distance of each position from its nearer limit, shape (nq,)."""
@@ -219,13 +193,6 @@ class Postures:
         """
         faults = (posture.depth > 0.0) + (np.max(posture.leans, initial=-1.0) > 0.0)
         return posture.independence(rows) * self.margin(posture.q) * 0.1 ** int(faults)
-
-    def is_too_fast(self, posture: Posture, rows: Sequence[int], rates: FloatArray) -> bool:
-        """Whether a joint exceeds its speed limit where rows have given rates."""
-        slopes = np.vstack([posture.constraints, posture.gradients[list(rows)]])
-        wanted = np.concatenate([np.zeros(len(posture.constraints)), rates])
-        v = np.linalg.lstsq(slopes, wanted, rcond=None)[0]
-        return bool(np.any(np.abs(v) > self._fastest))
 
     def guesses(self, count: int) -> FloatArray:
         """Random configurations within the limits, shape (count, nq); the same in each call."""

@@ -20,7 +20,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from drake_dae import references as rs
 from drake_dae import robots
 from drake_dae.arguments import checked
-from drake_dae.arrays import listed, unknown_name
+from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.files import read_text
 from drake_dae.references import Reference
@@ -128,7 +128,7 @@ _INTEGRATOR = {
 }
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Scenario:
     """A robot in contact, its references or task, and its simulation.
 
@@ -202,10 +202,6 @@ class Scenario:
         """Whether the gains are left out and will be computed."""
         return self.law.gains is None and self.plant.material is not None
 
-    def __repr__(self) -> str:
-        file, names = Path(self.robot.file).name, listed(c.name for c in self.constraints)
-        return f"Scenario('{self.description}', robot='{file}', constraints={names})"
-
     def __eq__(self, other: object) -> bool:
         # Arrays and Drake's SimulatorConfig cannot be compared directly.
         return isinstance(other, Scenario) and scenario_data(self) == scenario_data(other)
@@ -237,7 +233,6 @@ _CONSTRAINTS = (
     "PrismaticLoopJoint AxisNormalToSurface RollingWheel"
 )
 _OUTPUTS = "PointCoordinates AxisCoordinates SurfaceCoordinates TiltFromNormal JointPositions"
-_PLANTS = "IdealConstraints MultibodyPlant CompliantContact OwnPlant"
 # What stands in a scenario for the types in annotations. A new member is one name here.
 FAMILIES: dict[type, Family] = {
     Surface: _family(robots, _SURFACES),
@@ -247,9 +242,7 @@ FAMILIES: dict[type, Family] = {
     Stage: _family(robots, "FlexibleJoints DcMotors ElectrohydraulicServos"),
     Load: _family(robots, "KnownForce JointFriction"),
     Reference: Family(_REFERENCES, float),
-    parts.ScenarioPlant: _family(
-        parts, "IdealConstraints MultibodyPlant CompliantContact OwnPlant"
-    ),
+    parts.ScenarioPlant: _family(parts, "IdealConstraints MultibodyPlant CompliantContact"),
     parts.Poles: _family(parts, "Poles Coefficients Matrices"),
     Phase: _family(phases, "Approach Press Move Dwell Release Retreat"),
 }
@@ -333,7 +326,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     changed = []
     for setting in settings:
         key, separator, value = setting.partition("=")
-        if not separator or not all(key.split(".")):
+        if not separator:
             raise ScenarioError((f"--set {setting}", "expected key=value, for example duration=5"))
         scenario_reader().put(data, key, form.load_yaml(value, key))
         changed.append(key)

@@ -1,14 +1,14 @@
 """The start of the runs of a scenario."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae import Signal, ZeroDynamics
+from drake_dae.arrays import FloatArray
+from drake_dae.dae import ZeroDynamics, places_of
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots import Constraint, Links, RobotModel
@@ -41,13 +41,10 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
         numbers["plant.parameters"] = dict(of_plant.parameters)
         numbers["plant.payloads"] = {f"{p.name}.mass": p.mass for p in of_plant.payloads}
         numbers["plant.disturbances"] = {f"plant_disturbance_{i}.force": d.force for i, d in pushes}
-    parameters = plant.parameters(at_plant)
     for key, values in numbers.items():
         with at(key):
             for name, value in values.items():
-                # A user's own plant may not let numbers be set, and has been made with these.
-                if not np.array_equal(parameters[plant.dae.parameter_slice(name)], np.ravel(value)):
-                    plant.set_parameter(at_plant, name, value)
+                plant.set_parameter(at_plant, name, value)
     with at("plant"):
         of_plant.begin(plant, at_plant)
     force, encoders, gains = scenario.sensors.force, scenario.sensors.encoders, scenario.law.gains
@@ -71,7 +68,7 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
             outputs = law.layout.values(goal)
             for name, error in scenario.start.errors.items():
                 with at("start.errors"):
-                    index = _index_of(name, plant.dae.output_signals, "output")
+                    (index,) = places_of("output", [name], plant.dae.output_signals)
                     if law.degrees[index] == 0:
                         text = "has degree 0: the law meets it at once and it has no start error"
                         raise ModelError(f"'{name}' {text}")
@@ -96,7 +93,8 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
                 moving = zeros.state(goal, state, own).copy()
             for name, value in scenario.start.velocities.items():
                 with at("start.velocities"):
-                    moving[nq + _index_of(name, model.links.velocity_signals, "velocity")] = value
+                    (index,) = places_of("velocity", [name], model.links.velocity_signals)
+                    moving[nq + index] = value
             plant.set_consistent_state(at_plant, moving, [*scenario.start.velocities])
     if loop.sensor is not None:
         _, rest, _ = model.balance.rest(state[:nq], forces, parameters)
@@ -126,25 +124,22 @@ def _at_rest(
             "a task begins at rest, and its first phase in contact with a surface that moves "
             "then; begin with a phase without contact, such as Approach"
         )
+    # A task that begins without contact does not begin behind its surface, or only as deep as the
+    # force that counts as none presses it.
     task, material = scenario.task, scenario.plant.material
-    if task is None or (made := task.make()).contacts[0]:
+    if task is None or material is None or task.make().contacts[0]:
         return state
-    # A task that begins without contact does not begin behind its surface. On a contact that gives
-    # way it may be as deep as the force that counts as none presses it.
-    contact = opening_contact(scenario, model)
-    if (touch := contact.touch(model.links)) is None:
+    touch = opening_contact(scenario, model).touch(model.links)
+    if touch is None:
         return state
     place = model.links.position(touch.frame, touch.point)
     above = model.dae.trace("start", {"above": touch.clearance(place)}, often=False)
     depth = -above(state, model.dae.parameters_of(loop.plant.dae, parameters))[0].item()
-    if depth > _SLACK and (
-        material is None
-        or depth * material.stiffness_on(model, task.contact_force) > task.contact_force
-    ):
+    if depth * material.stiffness_on(model, task.contact_force) > task.contact_force:
         raise ModelError(
-            f"start.positions put the point of '{contact.name}' {depth:.3g} m behind its "
-            f"surface, and {made.phases[0].name} begins in front of it; start outside, or "
-            "turn the normal of the surface around if its free side is the other one"
+            f"start.positions put the point of {touch.frame} {depth:.3g} m behind its surface, and "
+            "the task begins in front of it; start outside, or turn the normal of the surface "
+            "around if its free side is the other one"
         )
     return state
 
@@ -153,15 +148,12 @@ def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:
     """The constraint of the contact of a task."""
     assert scenario.task is not None
     fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
-    name, there = scenario.task.contact, ", ".join(fitting) or "none"
-    with at("task.contact"):
-        if name and name not in fitting:
-            text = f"'{name}' is not a unilateral constraint with one force; these are {there}"
-            raise ModelError(text)
-        if not name and len(fitting) != 1:
-            text = f"needed, since the unilateral constraints with one force are {there}; give one"
-            raise ModelError(text)
-    return fitting[name] if name else next(iter(fitting.values()))
+    name = scenario.task.contact or (next(iter(fitting)) if len(fitting) == 1 else "")
+    if name not in fitting:
+        there = ", ".join(fitting) or "none"
+        text = f"'{name}': expected one of the unilateral constraints with one force, {there}"
+        raise ScenarioError(("task.contact", text))
+    return fitting[name]
 
 
 def start_state(
@@ -224,7 +216,7 @@ def start_guess(scenario: Scenario, links: Links, others: FloatArray | None = No
     """The initial guess of q: start.positions, and other joints at `others` or their defaults."""
     guess = (links.default_positions if others is None else others).copy()
     for name, value in scenario.start.positions.items():
-        index = _index_of(name, links.position_signals, "joint position")
+        (index,) = places_of("joint position", [name], links.position_signals)
         low, high = (limits[index] for limits in links.position_limits)
         if not low <= value <= high:
             unit = links.position_signals[index].unit
@@ -233,11 +225,3 @@ def start_guess(scenario: Scenario, links: Links, others: FloatArray | None = No
             )
         guess[index] = value
     return guess
-
-
-def _index_of(name: str, signals: Sequence[Signal], kind: str) -> int:
-    """The index of a name among signals."""
-    names = [signal.name for signal in signals]
-    if name not in names:
-        raise ModelError(unknown_name(kind, name, names))
-    return names.index(name)

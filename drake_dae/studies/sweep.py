@@ -138,9 +138,9 @@ def sweep(
                     ahead, opened = 4 * count, _processes(count, time_limit, most)
                 else:
                     opened = nullcontext(lambda *args: executor.submit(run_one, *args))
-                size = {"total": len(chosen), "initial": len(done), "unit": "run"}
+                size = {"total": len(chosen), "initial": len(done), "ncols": 79, "nrows": 24}
                 is_hidden = None if progress else True  # None: without a terminal.
-                with opened as submit, tqdm(**size, disable=is_hidden, ncols=79) as bar:
+                with opened as submit, tqdm(**size, unit="run", disable=is_hidden) as bar:
                     _run(todo, lambda run: submit(settings, chosen[run]), ahead, journal, bar)
             results = journal.results()
     return Study(tuple(chosen), tuple(results[run] for run in range(len(chosen))))
@@ -300,7 +300,6 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
     patterns += [rf"plant\.{re.escape(name)}" for name in numbers]
     if not plant.carries:
         patterns.append(r"plant\.parameters(\..+)?")
-    if plant.adjusts and not plant.carries:
         patterns.append(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
     if not (isinstance(base.law.gains, Matrices) or is_advised or base.task is not None):
         patterns.append(r"law\.gains\..+")

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, vector
+from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import Block, Held, Requirement, where_finite
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae import (
@@ -187,8 +187,8 @@ class TrackingController(ParameterizedSystem, Controller):
     Output ports:
         control: u, shape (p,).
         tracking_error: e = z - r (29) by the controller's own model, one entry per output.
-        integral: The integrals of errors, shape (k,), if the law has any. They start at zero, or at
-            the values of `set_integral`.
+        integral: The integrals of errors, shape (k,), if the law has any: its only state, which
+            starts at zero.
 
     The first two output ports have direct feedthrough from all input ports except `hold`, and
     except `measured_force` if the law only integrates it. Numeric parameter 0 holds the model's
@@ -231,22 +231,6 @@ class TrackingController(ParameterizedSystem, Controller):
         block = law_block(law, self.sample_period)
         self.equations = law.system
         super().__init__(law.system, block, law.exogenous_degrees, sees_steps=True)
-
-    def set_integral(self, context: Context, integral: ArrayLike) -> None:
-        """Sets the initial integrals of the errors, shape (k,).
-
-        Raises:
-            ModelError: The shape is wrong, or the law has no integrals.
-        """
-        self.check_context(context)
-        size = len(self.law.integral.outputs)
-        if not size:
-            raise ModelError(f"{self.get_name()}: its law has no integral action")
-        values = vector("integral", integral, size)
-        if self.sample_period:
-            context.SetDiscreteState(values)
-        else:
-            context.SetContinuousState(values)
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
         """Changes the gains in a context: a design such as `poles(-8.0)`, or finished gains.

@@ -19,7 +19,7 @@ from drake_dae.dae.disturbance import (
     shares,
 )
 from drake_dae.errors import ModelError
-from drake_dae.systems.break_away import LITTLE, Contacts, ContactTerms, Observing
+from drake_dae.systems.break_away import Contacts, ContactTerms, Observing, slowed
 from drake_dae.systems.estimator_parameters import MEMORY, NOISY_MEMORY, ParameterFilter, Regressor
 from drake_dae.systems.plant import ParameterizedSystem
 from drake_dae.systems.sensors import one_each
@@ -423,13 +423,8 @@ class EstimatorSample:
             moves = mass + period * ca.diag(damping)
             stepping = PositiveDefiniteFactorization(moves)
         moved = qd + period * stepping.solve(push - friction_force)
-        # Friction acts against the velocity that there would be without it, which it at most stops.
-        # Otherwise it would turn a light tool about from sample to sample.
-        forces = self._contacts.developed(ca.vertcat(q, moved), v, parameters)
-        made = period * stepping.solve(forces)
-        stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, LITTLE)
-        # The noise of a force sensor may be less than zero.
-        moved += ca.mtimes(made, ca.fmin(mu, ca.fmax(stopping, 0.0)))
+        impulses = period * mu * self._contacts.pressing(v)
+        moved = slowed(moved, contact.planes, impulses, stepping.solve)
         unused = ca.logic_or(self._contacts.is_lost(v), self.inputs["hold"] != 0)
         if self._breaks_away:  # What has not slid yet sticks, with any friction that this needs.
             sticks = ca.logic_not(ca.logic_or(unused, slid > 0))
@@ -550,6 +545,12 @@ def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:
             f"{system.name}: a state_rate is for robots with rigid joints, whose states are "
             "positions and velocities; behind springs, motors or valves measure the velocities, "
             "or let the encoders form differences by a velocity_bandwidth"
+        )
+    unknown = [c.force for c in system.contacts if c.friction and c.sliding is None]
+    if unknown:
+        raise ModelError(
+            f"{system.name}: a state_rate needs the velocity with which '{unknown[0]}' slides, "
+            "UnilateralInput.sliding"
         )
     if not ca.simplify(system.f[:count] - system.state[count:]).is_zero():
         raise ModelError(

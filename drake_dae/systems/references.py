@@ -60,15 +60,10 @@ def reference_block(references: Sequence[Reference], degrees: Sequence[int]) -> 
         raise ReferenceSignalError(
             f"the references cover {covered} outputs, the law has {len(degrees)}"
         )
-    wholes = map(_whole, references)
+    wholes = (r.reference if isinstance(r, ReferenceRows) else r for r in references)
     ranges = (each.range for each in wholes if isinstance(each, TrajectoryReference))
     outputs = {"reference": stacked_expression(references, degrees, TIME)}
     return Block("reference", outputs=outputs, requirements=tuple(ranges))
-
-
-def _whole(reference: Reference) -> Reference:
-    """The reference of which this one may be some rows."""
-    return reference.reference if isinstance(reference, ReferenceRows) else reference
 
 
 @checked(ReferenceSignalError)

@@ -18,28 +18,14 @@ from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 from runs import scenario
 from timing import calls, has_compiler, race, times
-from two_arms import two_arms
 
-from drake_dae import (
-    DcMotors,
-    FlexibleJoints,
-    RobotPlant,
-    TrackingLaw,
-    build_scenario,
-    compile_diagram,
-    poles,
-    rollout,
-    simulate,
-    sweep,
-)
+from drake_dae import build_scenario, compile_diagram, rollout, simulate, sweep
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.running import start_values
 from drake_dae.scenario.build import make_plant
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.studies import make_variations
 
-SPRINGS = FlexibleJoints(8000.0, inertia=1.0)
-MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 FIXED = [
     "integrator.integration_scheme=runge_kutta3",
     "integrator.use_error_control=false",
@@ -200,18 +186,6 @@ def test_rollout(case, compare):
         compare(figure, took[how], "simulate", took["simulate"])
 
 
-def test_tracing(compare):
-    """Model with its comparison to the plant, structure, law and plant; nothing is compiled."""
-    seconds = []
-    for _ in range(2):
-        began = time.process_time()
-        model = two_arms([SPRINGS, MOTORS])
-        law = TrackingLaw(model.dae, poles(-4.0))
-        RobotPlant(model, structure=law.structure)
-        seconds.append(time.process_time() - began)
-    compare("tracing, 14 joints with springs and motors", min(seconds), wanted=5.0)
-
-
 def test_starting(compare, tmp_path):
     """Processor time of commands and of what they stand on, in alternation."""
 
@@ -232,14 +206,6 @@ def test_starting(compare, tmp_path):
     ):
         found = np.array([[seconds(*words), seconds("-c", bare)] for _ in range(5)])
         compare(figure, *found.min(axis=0)[:1], bare, found.min(axis=0)[1])
-
-
-@pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_wall"])
-def test_a_run_beside_real_time(name, compare):
-    chosen = scenario(name, "integrator.accuracy=1e-6")
-    loop, context = build_scenario(chosen)
-    run = simulate(loop.diagram, context, chosen.duration, chosen.integrator)
-    compare(f"1 s of {name}", 1.0 / run.times_real_time, "real time", 1.0, 0.05)
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def test_view_says_what_is_missing(demo, tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
     for path, text in (
-        (folder.parent / "runn", f"'.*runn' is no folder of a run; there is {folder}"),
+        (folder.parent / "runn", "'.*runn' is no folder of a run"),
         (run, "'.*run' is no folder of a run"),
     ):
         assert main(["play", str(path)]) == 1
@@ -166,7 +166,7 @@ def test_a_printed_command_works_as_printed(tmp_path):
     play, plot = line.split("; plots: ")
     subprocess.run(f"{plot} --all", shell=True, env=bare, cwd=tmp_path, check=True)
     assert list(out.glob("*.png"))
-    assert shlex.split(play)[0] == str(script)
+    assert shlex.split(play)[0] == sys.executable
 
 
 @pytest.mark.slow
@@ -210,15 +210,3 @@ def test_a_shipped_scenario_is_shown_as_it_is_or_where_it_is(capsys):
     assert capsys.readouterr().out == find_scenario("seven_joint_dome").read_text()
     assert main(["print", "--path"]) == 0
     assert capsys.readouterr().out.strip() == str(find_scenario(DEFAULT_SCENARIO))
-
-
-@pytest.mark.parametrize(
-    ("name", "words"), [("two_link_wal", "'two_link_wall'"), ("binary.yaml", "binary.yaml")]
-)
-def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe")
-    assert main(["print", name]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: ")
-    assert words in line

@@ -62,12 +62,12 @@ def test_errors_and_roughness_are_those_of_the_gains(numbers):
     )
     pressed = T, given.delay, given.mobility, given.stiffness
     force, push = sampled_loop(contact, of_point, *pressed).deviations()
-    assert found.noise_error == pytest.approx(error)
-    assert found.noise_force == pytest.approx(force)
+    assert found.free.by_noise == pytest.approx(error)
+    assert found.contact.by_noise == pytest.approx(force)
     parts = (5.0 * jump) ** 2 + (0.7 / given.mobility * push) ** 2
     assert found.roughness == pytest.approx(parts**0.5)
-    assert found.position_error > error
-    assert found.force_error > force
+    assert found.free.error > error
+    assert found.contact.error > force
 
 
 def test_noise_is_met_by_equal_poles_and_a_slow_estimator():
@@ -79,7 +79,7 @@ def test_noise_is_met_by_equal_poles_and_a_slow_estimator():
     p = found.gains.position_rate
     assert found.gains.position_gains(3) == pytest.approx([p**3, 3.0 * p**2, 3.0 * p])
     assert found.gains.position_gains(2) == pytest.approx([p**2, 2.0 * p])
-    assert found.position_error < 7.0e-5
+    assert found.free.error < 7.0e-5
     exact = advised_gains(replace(given, noise=quiet), 1.0)
     assert exact.gains.position_damping == pytest.approx(0.5)
     assert exact.gains.position_rate == pytest.approx(50.0)
@@ -99,14 +99,14 @@ def test_within_a_bound_of_an_error_the_smoothest_gains_are_taken():
     """Each bound alone leaves the other error as small as the roughness allows."""
     given = situation(1e-5, 1e5, 0.03, 1)
     best = advised_gains(given, 1.0)
-    near = advised_gains(given, 1.0, position_error=4.0 * best.position_error)
-    assert best.position_error < near.position_error <= 4.0 * best.position_error
+    near = advised_gains(given, 1.0, position_error=4.0 * best.free.error)
+    assert best.free.error < near.free.error <= 4.0 * best.free.error
     assert near.gains.position_rate < 0.9 * best.gains.position_rate
-    assert near.force_error == pytest.approx(best.force_error, rel=0.1)
-    soft = advised_gains(given, 1.0, force_error=1.5 * best.force_error)
-    assert best.force_error < soft.force_error <= 1.5 * best.force_error
+    assert near.contact.error == pytest.approx(best.contact.error, rel=0.1)
+    soft = advised_gains(given, 1.0, force_error=1.5 * best.contact.error)
+    assert best.contact.error < soft.contact.error <= 1.5 * best.contact.error
     both = advised_gains(
-        given, 1.0, position_error=4.0 * best.position_error, force_error=1.5 * best.force_error
+        given, 1.0, position_error=4.0 * best.free.error, force_error=1.5 * best.contact.error
     )
     assert both.roughness <= near.roughness
 
@@ -115,7 +115,7 @@ def test_within_a_bound_of_an_error_the_smoothest_gains_are_taken():
 def test_an_error_that_no_gains_keep_is_refused_with_what_forbids_it():
     """An error, of good sensors or by the noise of bad ones, or the allowed roughness."""
     good, bad = situation(1e-6, 1e5, 0.03, 1), situation(1e-3, 1e5, 0.03, 1)
-    least = advised_gains(bad, 1e3).position_error
+    least = advised_gains(bad, 1e3).free.error
     with pytest.raises(GainError, match=r"1e-06 m"):
         advised_gains(good, 1.0, position_error=1e-6)
     with pytest.raises(GainError, match="noise"):

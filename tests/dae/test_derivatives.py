@@ -66,7 +66,7 @@ def with_inertia(arm: DaeSystem, **fields) -> DaeSystem:
     )
 
 
-def test_the_implicit_form_may_be_given_in_fewer_operations():
+def test_a_mass_matrix_and_the_implicit_form_change_nothing():
     arm = PROBLEMS["two_link_arm"]().system
     plain = with_inertia(arm)
     rate = ca.jtimes(arm.k, arm.state, arm.f)
@@ -83,10 +83,11 @@ def test_the_implicit_form_may_be_given_in_fewer_operations():
             {"x": system.state},
             {"a": find_structure(system).drift, "b": find_structure(system).control_matrix},
         )(state)
-        for system in (plain, with_inertia(arm, implicit=implicit))
+        for system in (arm, plain, with_inertia(arm, implicit=implicit))
     ]
-    for one, two in zip(*values, strict=True):
-        np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12)
+    for one, two, three in zip(*values, strict=True):
+        np.testing.assert_allclose(one, three, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(two, three, rtol=1e-12, atol=1e-12)
     wrongs = (
         lambda x, v: (implicit(x, 2 * v)[0], implicit(x, v)[1]),
         lambda x, v: (implicit(x, v)[0], 2 * implicit(x, v)[1]),

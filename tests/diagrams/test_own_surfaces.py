@@ -1,15 +1,12 @@
 """Surfaces of a user's own in scenarios: formulas, height maps and meshes, held as predicted."""
 
 import json
-import warnings
 
 import numpy as np
-import pytest
 from runs import run_scenario, scenario
 
 from drake_dae import load_scenario
 from drake_dae.cli import main
-from drake_dae.scenario import complete_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.scenario import save_scenario
 from drake_dae.scenario.shipped import find_scenario
@@ -79,24 +76,3 @@ def test_where_the_robot_leaves_the_data_is_reported(tmp_path):
     _, told = judge_run(case, loop, context, record).notes
     assert "wall: the robot is beyond the edge of the data by up to 1" in told
     assert "1 mm, first at 0 s; there the surface continues as a plane" in told
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("scale", "is_told"), [(1.0, True), (1e-3, False), (1e-2, False)])
-def test_a_mesh_that_seems_to_be_in_millimetres_is_reported(scale, is_told, tmp_path):
-    """A sheet of 400 by 400 units, and an arm of 1.5 m."""
-    rows = [f"v {x} {y} 0" for x in (0, 400) for y in (0, 400)]
-    (tmp_path / "sheet.obj").write_text("\n".join([*rows, "f 1 3 4", "f 1 4 2\n"]))
-    (tmp_path / "task.yaml").write_text(
-        "robot: {file: package://drake_dae_models/seven_joint_arm.urdf, base: {weld: base}}\n"
-        "constraints: [{frame: tool, name: part, surface: !MeasuredSurface {file: sheet.obj, "
-        f"point: [0.4, -0.2, 0.2], scale: {scale}}}}}]\n"
-        "references: {part.force: 10, tool.x: 0.6, tool.y: 0.0}\n"
-    )
-    scenario = load_scenario(tmp_path / "task.yaml")
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        complete_scenario(scenario)
-    found = [str(one.message) for one in told if "millimetre" in str(one.message)]
-    assert len(found) == is_told
-    assert all("'part' is 400 m long" in text and "scale: 0.001" in text for text in found)

@@ -94,17 +94,6 @@ def test_shafts_have_the_units_of_the_joints_that_they_drive(driven):
     assert [s.unit for s in own.state_signals] == [*wanted, *(f"{unit}/s" for unit in wanted)]
 
 
-def test_motors_may_have_no_resistance():
-    """L I' = u - K_m N q' then, which is (75) without R I."""
-    own = DcMotors(0.1, 2e-3, 0.0, [100.0, 80.0]).attach(links())
-    velocity = ca.SX.sym("v", 2)
-    symbols = ca.vertcat(*[p.symbol for p in own.parameters])
-    values = np.concatenate([p.value for p in own.parameters])
-    drift = ca.Function("drift", [own.state, velocity, symbols], [own.drift(velocity, velocity)])
-    found = drift([3.0, -4.0], [0.2, 0.5], values).full()[:, 0]
-    np.testing.assert_allclose(found, [-0.1 * 100.0 * 0.2, -0.1 * 80.0 * 0.5], rtol=1e-14)
-
-
 @pytest.mark.slow
 def test_a_drive_holds_any_force_at_rest(stage):
     """And the control does not reach the constraint force in the same instant."""

@@ -77,24 +77,6 @@ def test_textbook_arm_is_the_urdf_arm():
             )
 
 
-def test_names_and_units():
-    dae = arm("seven_joint").model.dae
-    assert [s.name for s in dae.output_signals] == [
-        "tool.y",
-        "tool.z",
-        "tool.z_axis.y",
-        "tool.z_axis.z",
-        "joint3",
-        "joint7",
-        "wall.force",
-    ]
-    assert [s.unit for s in dae.output_signals] == ["m", "m", "", "", "rad", "rad", "N"]
-    assert arm("seven_joint").structure.manifold.residual_signals == (
-        Signal("wall.distance", "m"),
-        Signal("wall.distance'", "m/s"),
-    )
-
-
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
 def test_configuration_inverts_the_outputs(name):
     """q = psi(z_1) of (58), checked by MultibodyPlant's own outputs."""

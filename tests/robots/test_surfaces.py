@@ -293,27 +293,6 @@ def test_a_ball_is_pushed_off_a_mesh_along_the_normal_of_its_surface(name):
         assert_allclose(size, expected, rtol=0.08)
 
 
-def test_a_mesh_is_as_fine_as_its_surface_is_curved():
-    """Its vertices except the lowest stand on the surface and at the depth below it, by pairs."""
-
-    def vertices(surface, place, size):
-        text = surface.layer(place, size, DEPTH).form.source().in_memory().mesh_file.contents()
-        lines = text.decode().splitlines()
-        count = next(int(line.split()[1]) for line in lines if line.startswith("POINTS"))
-        begin = next(k for k, line in enumerate(lines) if line.startswith("POINTS")) + 1
-        return np.array([[float(x) for x in line.split()] for line in lines[begin : begin + count]])
-
-    plane, dome = (PIECES[name][0] for name in ("plane", "ellipsoid"))
-    flat, curved = vertices(plane, (0, 0, 0), 0.1), vertices(dome, (0, 0, 0.2), 0.1)
-    assert len(flat) == 2 * 7 * 7 + 1
-    assert len(curved) > 2 * 20 * 20
-    np.testing.assert_allclose(flat[:-1:2] @ [0.5**0.5, 0, 0.5**0.5], 0.0, atol=1e-9)
-    np.testing.assert_allclose(flat[1:-1:2] @ [0.5**0.5, 0, 0.5**0.5], -DEPTH, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(curved[:-1:2], axis=1), 0.2, atol=1e-9)
-    heights = vertices(PIECES["heights"][0], (0, 0, 0), 9.0)[:-1:2]
-    assert np.ptp(heights[:, :2], axis=0) == pytest.approx((0.04, 0.1))
-
-
 @pytest.mark.parametrize(
     ("surface", "place", "size", "depth", "message"),
     [

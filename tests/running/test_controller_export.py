@@ -6,14 +6,16 @@ import subprocess
 
 import numpy as np
 import pytest
+from arms import arm, law
 from c_controller import CController, compile_c
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from runs import MANY_PIECES, scenario
 
-from drake_dae import build_scenario, export_controller
+from drake_dae import CompliantPlant, build_scenario, export_controller, make_closed_loop
 from drake_dae.errors import ModelError
 from drake_dae.running.export import ControllerPart, Ticks
+from drake_dae.systems import PointMaterial
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 RUNNING, HOLDING, STOPPED, WAITING = range(4)
@@ -74,6 +76,20 @@ def test_the_controller_does_what_it_does_in_drakes_simulator(name, settings, tm
     # The same operations in the same order: what differs are the last bits of sin and cos, if any.
     assert float(off) <= 1e-12
     assert re.fullmatch(r"a step: .* us in the median, .* at the 99.9th percentile.*", lines[1])
+
+
+@needs_compiler
+def test_a_controller_that_samples_nothing_is_one_step_too(tmp_path):
+    """It acts at each step of a discrete plant, here one whose contact gives way."""
+    found = arm("two_link")
+    plant = CompliantPlant(found.model, PointMaterial(), structure=found.structure)
+    loop = make_closed_loop(plant, law("two_link"), {"tool.z": 0.3, "wall.force": 20.0})
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, found.structure.states[0])
+    assert ControllerPart(loop.diagram, context).code.steps.rates == []
+    export_controller(loop, context, "arm", tmp_path, duration=0.03)
+    done = played(tmp_path, "arm", "-O1")
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -273,3 +289,4 @@ def test_ticks_are_the_largest_that_all_times_are_multiples_of():
     assert [ticks.at(time) for time in (0.0, 0.0005, 0.0005 + 1e-15, 0.0006)] == [0, 1, 1, 2]
     # To the bit those of Drake: 9 * 0.001 + 0.0005 is not 19 * 0.0005.
     assert ticks.time(19) == (0.0025 - 0.002) + 9 * 0.001
+    assert Ticks([], 0.01).period == 0.01

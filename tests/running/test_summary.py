@@ -66,9 +66,9 @@ def table(text, head):
 def test_the_first_line_judges_and_the_last_says_what_to_change():
     over = limited(LimitKind.CONTROL, "motor1", "N m", -7.25, 2.5, -7.0, 7.0)
     found = summary(ranges=[over])
-    told = replace(found, statistics=None, remedies=["be slower"]).text.splitlines()
+    told = replace(found, statistics=None).text.splitlines()
     assert told[0].startswith("BAD: motor1 has 7.25 N m at 1 s, 1.04 times")
-    assert told[-1].split("  ")[-1].strip() == "be slower"
+    assert "drake-dae analyze" in told[-1]
     assert found.missed
 
 

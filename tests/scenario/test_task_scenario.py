@@ -214,8 +214,8 @@ def test_a_task_that_is_given_up_fails_the_check(guarded, told):
 
 @pytest.mark.slow
 def test_the_shipped_task_tells_its_story(told):
-    """15 mm do not reach the wall, and it tries again; the touch stays below what was told."""
-    code, found, text, record = told("wall_guarded", "duration=4.5")
+    """15 mm do not reach the wall, and it tries again; the touch is as hard as its momentum."""
+    code, found, _, record = told("wall_guarded", "duration=4.5")
     assert (code, found["outcome"]) == (0, "good")
     names = [one["phase"] for one in found["phases"]]
     assert names == ["feel", "feel", "Press", "Dwell", "slide", "Release", "Retreat", "done"]
@@ -230,11 +230,8 @@ def test_the_shipped_task_tells_its_story(told):
     jacobian = arm.constraint_jacobian[0]
     mass = 1.0 / (jacobian @ np.linalg.solve(arm.mass, jacobian))
     alone = 0.03 * np.sqrt(1e5 * mass)
-    expected = 2.0 + alone + 1e5 * 0.03 * 0.002
-    assert 0.5 * alone < peak < expected
-    limit = float(text.split("A touch at 0.03 m/s is expected to stay below ")[1].split(" N")[0])
-    # The expectation is made where the law has the wall, 8 mm before.
-    assert_allclose(limit, expected, rtol=0.02)
+    # The felt force, the mass at its speed, and what it goes until the law reacts.
+    assert 0.5 * alone < peak < 2.0 + alone + 1e5 * 0.03 * 0.002
 
 
 BIASED = "sensors.force={sample_period: 0.001, noise_deviation: 0.3, bias: 1.0}"
@@ -285,31 +282,15 @@ def test_a_bias_is_found_before_the_touch(observed, told):
 
 
 @pytest.mark.slow
-def test_a_contact_that_is_lost_after_the_last_phase(observed, told):
-    """A push pulls with 40 N where the arm rests with 10 N; the law in contact would go on."""
-    push = "plant.disturbances=[{frame: tool, force: [-40, 0, 0], start_time: 0.8, end_time: 3}]"
-    only = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
-    settings = [push, only, "estimator=null", "task.patience=0.02", "duration=1.6"]
-    *_, text, found = told(observed, *settings, "plant.friction=0")
-    assert "held, the contact is lost at rest" in " ".join(text.split("; "))
-    assert found["constraint_force"][found.time < 0.8][-1] > 5.0
-    assert found["phase"][found.time < 0.8][-1, 2] == 1.0  # It is done.
-    assert np.all(found["constraint_force"][found.time > 1.0] == 0.0)
-    assert np.max(np.abs(found["state"][-1, 2:])) < 0.05
-
-
-@pytest.mark.slow
 def test_gains_of_a_task_are_advised(observed, told):
     """With friction of 0.3 in Drake's contact: 0.02 mm and 0.05 N were asked, 3.6 mm and 3.2 N
-    were; the peak of the touch stays below what was told."""
+    were."""
     text = OBSERVED.replace(
         "law:\n  gains: {all: [-25]}\n  constraint_damping: {all: [-250]}\n", ""
     )
     text = text.replace('  gains: {outputs: {wall.distance: [-8], "*": [-25]}}\n', "")
     text = text.replace("estimator: {rate: 60, parameters: [wall.friction]}\n", "")
     observed.write_text(text.replace(", noise_deviation: 0.3", ""))
-    *_, summary, found = told(observed, "duration=2.5", "task.phases.0.speed=0.03")
+    found = told(observed, "duration=2.5", "task.phases.0.speed=0.03")[-1]
     errors = late(found, after=2.0)
     assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < [2e-5, 0.05])
-    peak = float(summary.split("A touch at 0.03 m/s is expected to stay below ")[1].split(" N")[0])
-    assert 0.3 * peak < np.max(found["constraint_force"][found.time < 1.0]) < peak

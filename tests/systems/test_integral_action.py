@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arms import arm, error_controlled, law, numbers, touching
+from arms import arm, error_controlled, numbers, touching
 from numpy.testing import assert_allclose
 
 import drake_dae as dd
@@ -25,7 +25,7 @@ def follow(model, tracking, duration, *, start=None, change=None, wanted=WANTED,
         plant.set_parameter(own, name, value)
     if start is not None:
         controller = loop.controller.GetMyMutableContextFromRoot(context)
-        loop.controller.set_integral(controller, start)
+        controller.SetContinuousState(start)
     dd.simulate(loop.diagram, context, duration, error_controlled(1e-9))
     return loop, loop.record(context)
 
@@ -90,6 +90,3 @@ def test_what_makes_no_sense_is_refused():
         dd.TrackingLaw(system, dd.poles(-4.0), integral=["tool.z", "tool.z"], **known)
     with pytest.raises(ModelError, match=r"integral: .*tool\.y"):
         dd.TrackingLaw(system, dd.poles(-4.0), integral=["tool.y"], **known)
-    controller = dd.TrackingController(law("two_link"))
-    with pytest.raises(ModelError, match="integral"):
-        controller.set_integral(controller.CreateDefaultContext(), [0.0])

@@ -4,15 +4,18 @@ A copy has possible inertias, and geometry that can be read and drawn; it lacks 
 What changed on the way is collected, and so is what is lost.
 """
 
+import logging
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
-from pydrake.geometry import Mesh
+from pydrake.geometry import Mesh, SceneGraph
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RotationalInertia
 
 from drake_dae.arrays import FloatArray, number_in
@@ -33,16 +36,6 @@ ARMATURE = "joint/armature"
 _OF_MANY_AXES = ("planar", "floating", "universal", "ball", "free")
 """Types of joints that no motor drives, and that follow no other joint."""
 
-_FLAT = 1e-8
-"""A scale of a mesh up to which Drake takes none."""
-
-_EMPTY, _UNREAD = "has size 0", "has a shape that Drake does not read"
-
-_ROUND = {"radius": 1, "length": 1}
-_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "capsule": _ROUND}
-_SIZES |= {"ellipsoid": {}, "mesh": {}}
-"""Shape -> how many numbers its sizes have; those of a geom of MJCF are in one list."""
-
 _TURNS = {"quat", "axisangle", "euler", "xyaxes", "zaxis"}
 
 _SERVOS = ("position", "velocity", "intvelocity", "general")
@@ -51,21 +44,26 @@ _SERVOS = ("position", "velocity", "intvelocity", "general")
 _ACTUATORS = (*_SERVOS, "motor", "damper", "cylinder")
 """What in a class has one default, under any of these names."""
 
-_LAW = ("dyntype", "gaintype", "biastype")
-
-_OF_GENERAL = {*_LAW, "dynprm", "gainprm", "biasprm"}
+_OF_GENERAL = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}
 """What motors and servos set themselves, whatever is the default."""
+
+_PROBES = {
+    ".urdf": '<robot name="r"><link name="a">{}</link></robot>',
+    ".sdf": '<sdf version="1.9"><model name="r"><link name="a">{}</link></model></sdf>',
+    ".xml": '<mujoco model="r"><asset>{1}</asset><worldbody><body>{0}</body></worldbody></mujoco>',
+}
+"""Models of a lone shape, and of its mesh."""
 
 
 class Mender:
     """Makes mended copies of files. A "model" is the name of a model instance, "" for a lone robot.
 
-    `folder` is an empty one for the copies, None to make none; with `has_geometry` geometry is
-    read, and with `drawn` converted to be drawn.
+    `folder` is an empty one for the copies; with `has_geometry` geometry is read, and with `drawn`
+    converted to be drawn.
     """
 
     def __init__(
-        self, files: RobotFiles, robot: Robot, folder: Path | None, has_geometry: bool, drawn: bool
+        self, files: RobotFiles, robot: Robot, folder: Path, has_geometry: bool, drawn: bool
     ) -> None:
         self.files, self.leave_out, self.folder = files, robot.leave_out, folder
         self.drives = robot.actuators is None  # Else the file's motors do not count.
@@ -75,13 +73,11 @@ class Mender:
         # Category of a warning and its text -> what it concerns; part that is lost -> where.
         self.told: dict[tuple[type[Warning], str], list[str]] = defaultdict(list)
         self.lost: dict[str, list[str]] = defaultdict(list)
-        self.originals: dict[Path, Path] = {}  # Copy -> its file.
-        # (model, joint) -> "effort" limit, "armature", "follows" (leader, ratio, offset), and the
-        # frame that is its "parent" in SDFormat.
+        self.copies = 0
+        # (model, joint) -> "effort" limit, "armature", and "follows" (leader, ratio, offset).
         self.joints: dict[tuple[str, str], dict[str, Any]] = defaultdict(dict)
         # Joints that the copies lack: model, name, child, and the frame that is their origin.
         self.floating: list[tuple[str, str, str, str]] = []
-        self.crossed: set[tuple[str, str]] = set()  # (model, link) without a visual shape.
 
     def copy(self, file: Path, model: str = "") -> Path:
         """A mended copy of a file; one that is neither URDF, SDFormat nor MJCF stays."""
@@ -93,13 +89,15 @@ class Mender:
             if kind == ".xml":
                 self._expand(root, file)
             for node in root.iter():
-                for value in (*node.attrib.values(), node.text or ""):
+                for value in map(str.strip, (*node.attrib.values(), node.text or "")):
                     if "$(" in value or "${" in value:
                         way = "is a template: xacro FILE -o robot.urdf writes the URDF"
-                        raise ModelError(f"{place_of(node)}: '{value.strip()}' {way}")
+                        raise ModelError(f"{place_of(node)}: '{value}' {way}")
                     if "," in value and number_in(value.replace(",", ".", 1)) is not None:
                         text = f"'{value}': numbers have a point, no comma"
                         raise ModelError(f"{place_of(node)}: {text}")
+                    if "://" in value:
+                        self.files.find(value, file)  # What is missing is collected.
             # Only the armature of joints without motor is lost.
             for part, place in take_lost(root, kind, {*self.leave_out} - {ARMATURE}):
                 self.lose(part, place)
@@ -109,18 +107,12 @@ class Mender:
                     self.tell("moments of inertia of no body become possible ones", text)
             for joint in root.iter("joint"):
                 self._mend_limits(joint)
-            if kind == ".urdf":
-                self._mend_urdf(root, file, model)
-            elif kind == ".sdf":
-                self._mend_sdf(root, file, model)
-            else:
-                self._mend_mjcf(root, file, model)
-        if self.folder is None:
-            return file
-        copy = self.folder / str(len(self.originals)) / file.name
+            mends = {".urdf": self._mend_urdf, ".sdf": self._mend_sdf, ".xml": self._mend_mjcf}
+            mends[kind](root, file, model)
+        copy = self.folder / str(self.copies) / file.name
+        self.copies += 1
         copy.parent.mkdir()
         copy.write_text(write_xml(root), "utf-8")
-        self.originals[copy] = file
         return copy
 
     def tell(self, kind: str, item: str, category: type[Warning] = RobotFileWarning) -> None:
@@ -156,8 +148,6 @@ class Mender:
 
     def _mesh(self, name: str, path: Path | None, collides: bool, kinds: tuple[str, ...]) -> str:
         """The file of a mesh as Drake reads it, of some kinds if any; "" if it is left out."""
-        if self.folder is None:
-            return str(path or "")
         drawn, why, way = path, "", "(robot.packages can name its folder)"
         if path is None:
             why = f"is in a package neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH {way}"
@@ -173,31 +163,29 @@ class Mender:
             self._leave_out(why, f"'{name if path is None else Path(name).name}'")
         return "" if why else str(drawn)
 
-    def _mend_shapes(self, link: Element, file: Path, model: str) -> None:
+    def _mend_shapes(self, link: Element, file: Path) -> None:
         """Leaves out what of a link's geometry Drake cannot take, in URDF and SDFormat."""
-        name, kinds = link.get("name", ""), (".obj", ".gltf") if self.drawn else ()
+        kinds = (".obj", ".gltf") if self.drawn else ()
         for shape in [*link.iterfind("visual"), *link.iterfind("collision")]:
-            is_visual = shape.tag == "visual"
-            faults = (_fault(form, file.suffix) for form in shape.iterfind("geometry/*"))
-            if fault := next(filter(None, faults), ""):
-                self._leave_out(fault, f"of '{name}'")
-                link.remove(shape)
-                continue
+            is_visual, is_kept = shape.tag == "visual", True
             for mesh in shape.iterfind("geometry/mesh"):
                 uri = mesh.find("uri")
                 text = mesh.get("filename", "") if uri is None else (uri.text or "").strip()
                 found = self.files.find(text, file)
                 path = self._mesh(text, found, not is_visual, kinds if is_visual else ())
                 if uri is None:
-                    mesh.set("filename", path)
+                    mesh.set("filename", f"file://{path}")
                 else:
-                    uri.text = path
-                if not path:
-                    link.remove(shape)
-                    self.crossed |= {(model, name)} if is_visual else set()
-            for material in shape.iterfind("material"):
-                if _remove(material, "texture") + _remove(material, "drake:diffuse_map"):
-                    self.tell("textures are left out", f"of '{name}'", GeometryWarning)
+                    uri.text = f"file://{path}"
+                is_kept = is_kept and bool(path)
+            if not is_kept:
+                link.remove(shape)
+                continue
+            forms = "".join(tostring(form, "unicode") for form in shape.iterfind("geometry"))
+            text = f'<{shape.tag} name="s">{forms}</{shape.tag}>'
+            if not _is_read(file.suffix, _PROBES[file.suffix].format(text)):
+                self._leave_out("Drake does not read", f"of '{link.get('name', '')}'")
+                link.remove(shape)
 
     # URDF and SDFormat.
 
@@ -207,7 +195,6 @@ class Mender:
         words = ("" if end is None else end.get("link") or end.text or "" for end in ends)
         parent, child = map(str.strip, words)
         of_file, is_placed = self.joints[model, name], parent == "world" and child in self.placed
-        of_file["parent"] = parent
         if kind == "floating" or (kind == "fixed" and is_placed):
             owner.remove(joint)
         if kind == "floating" and not is_placed:
@@ -228,14 +215,11 @@ class Mender:
             elif ratio is not None and offset is not None and "joint" in mimic.attrib:
                 joint.remove(mimic)
                 of_file["follows"] = (mimic.get("joint"), ratio, offset)
-                if ratio == 0.0:
-                    self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
 
     def _mend_urdf(self, root: Element, file: Path, model: str) -> None:
         root.attrib.setdefault("name", file.stem)
-        _remove(root, "mujoco")
         for link in root.iterfind("link") if self.has_geometry else ():
-            self._mend_shapes(link, file, model)
+            self._mend_shapes(link, file)
         # Drake refuses names of several colours, of none, or of one that is defined later.
         colours: dict[Any, list[Element]] = {}
         for material in root.iter("material"):
@@ -253,7 +237,6 @@ class Mender:
         kinds = {joint.get("name", ""): joint.get("type") for joint in joints}
         still = {name for name in kinds if self.joints[model, name].get("effort") == 0.0}
         still |= {name for name, kind in kinds.items() if kind in _OF_MANY_AXES}
-        moving = {name for name, kind in kinds.items() if kind != "fixed"}
         count = Counter[str]()
         for transmission in root.findall("transmission"):
             driven = {joint.get("name", "") for joint in transmission.iterfind("joint")}
@@ -261,7 +244,7 @@ class Mender:
             for name in driven & still:
                 text = f"joint '{name}': its effort is 0, or it has more than one axis"
                 self.lose("transmission/joint", text)
-            if not has_type or not driven & moving or driven & still:
+            if not has_type or driven & still:
                 root.remove(transmission)
                 continue
             for actuator in transmission.iterfind("actuator"):  # Their names may be equal.
@@ -279,20 +262,9 @@ class Mender:
         for number, body in enumerate(root.iter("model")):
             body.attrib.setdefault("name", file.stem + f"_{number}" * bool(number))
             for link in body.iterfind("link") if self.has_geometry else ():
-                self._mend_shapes(link, file, model)
+                self._mend_shapes(link, file)
             for joint in body.findall("joint"):
                 self._mend_joint(joint, body, model)
-        for joint in root.iter("joint"):
-            # Drake reads one of two dampings.
-            axes = (part for part in joint if part.tag in ("axis", "axis2"))
-            dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
-            if len({*map(number_in, dampings)}) > 1:
-                self.lose("axis2/damping", f"{place_of(joint)}: {' and '.join(dampings)}")
-            for pitch in joint.findall("thread_pitch"):  # In rad/m, of a thread that turns left.
-                if not (radians := number_in(pitch.text or "")):
-                    text = f"with thread_pitch {pitch.text} it is no screw; mend the file"
-                    raise ModelError(f"{place_of(joint)}: {text}")
-                pitch.tag, pitch.text = "screw_thread_pitch", repr(-2.0 * np.pi / radians)
 
     # MJCF: each element of the copy says all that it means, where it means it.
 
@@ -307,53 +279,37 @@ class Mender:
         self._include(root, file)
         root.attrib.setdefault("model", file.stem)
         _apply_defaults(root)
-        options = _compiler(root)
-        if options.get("coordinate") == "global":
+        if _compiler(root).get("coordinate") == "global":
             way = "MuJoCo up to 2.3.2 reads it, and saves it with local ones"
             raise ModelError(f"'{file.name}' has global coordinates; {way}")
         for equality in root.iterfind("equality"):
             for constraint in list(equality):
                 if constraint.attrib.pop("active", "true") == "false":
                     equality.remove(constraint)
-        for joint in root.iter("joint"):  # MuJoCo takes an empty range for none.
-            words = joint.get("range", "").split()
-            if joint.get("limited", "auto" if any(map(number_in, words)) else "false") == "false":
-                joint.attrib.pop("range", None)
         kinds = {one.get("name", ""): one.get("type", "hinge") for one in root.iter("joint")}
         kinds |= {one.get("name", ""): "free" for one in root.iter("freejoint")}
         for owner, motor in [(one, motor) for one in root.iterfind("actuator") for motor in one]:
-            law = motor.attrib.keys() & _OF_GENERAL if motor.tag == "general" else set()
-            own, gain = {key: motor.attrib.pop(key) for key in law}, 1.0
-            if motor.tag == "general" and {own.get(k, "") for k in _LAW} <= {"", "none", "fixed"}:
-                motor.tag = "motor"  # Of a control in another unit.
-                gain = abs(_first(own.get("gainprm", "")))
-            elif motor.tag in _SERVOS:  # Its control is no effort, and neither are its limits.
+            if motor.tag in _SERVOS:  # Its control is no effort, and neither are its limits.
                 motor.tag = "motor"
                 text = "servos become motors without their gains: controls are efforts"
                 self.tell(text, f"'{motor.get('name', motor.get('joint', ''))}'")
-                motor.attrib.pop("ctrlrange", None)
-                motor.attrib.pop("ctrllimited", None)
-            gear = abs(_first(motor.get("gear", "")))
-            for key, scale in (("ctrlrange", gain * gear), ("forcerange", gear)):
+                for key in ("ctrlrange", "ctrllimited", *_OF_GENERAL):
+                    motor.attrib.pop(key, None)
+            gear = abs(number_in([*motor.get("gear", "").split(), "1"][0]) or 1.0)
+            for key in ("ctrlrange", "forcerange"):
                 bounds = [number_in(word) for word in motor.get(key, "").split()]
-                if scale != 1.0 and bounds and None not in bounds:
-                    motor.set(key, " ".join(repr(scale * (bound or 0.0)) for bound in bounds))
+                if gear != 1.0 and bounds and None not in bounds:
+                    motor.set(key, " ".join(repr(gear * (bound or 0.0)) for bound in bounds))
             kind = kinds.get(motor.get("joint", ""))
             if motor.tag == "motor" and kind in _OF_MANY_AXES:
                 owner.remove(motor)
                 self.lose(f"{kind}/motor", place_of(motor))
-        for body in root.iter("body") if options.get("inertiafromgeom") != "true" else ():
+        for body in root.iter("body") if _compiler(root).get("inertiafromgeom") != "true" else ():
             inertial = body.find("inertial")
             if inertial is not None and number_in(inertial.get("mass", "")) == 0.0:
                 body.remove(inertial)
                 for geom in body.iterfind("geom"):
                     geom.set("mass", "0")
-        for geom in root.iter("geom"):
-            if _collides(geom):
-                geom.attrib.pop("contype", None)
-                geom.attrib.pop("conaffinity", None)
-            if "friction" in geom.attrib:  # Drake has none that resists turning.
-                geom.set("friction", "".join(geom.get("friction", "").split()[:1]))
 
     def _include(self, owner: Element, main: Path) -> None:
         for index, node in reversed(list(enumerate(owner))):
@@ -369,7 +325,7 @@ class Mender:
             owner[index : index + 1] = list(included)
 
     def _mend_mjcf(self, root: Element, file: Path, model: str) -> None:
-        self._mend_geoms(root, file, model)
+        self._mend_geoms(root, file)
         if not self.has_geometry:
             _remove(root, "contact")
         for joint in root.iter("joint"):
@@ -386,48 +342,51 @@ class Mender:
             elif name in self.placed and not free and body.find("joint") is None:
                 SubElement(body, "freejoint")  # Else Drake welds it.
 
-    def _mend_geoms(self, root: Element, file: Path, model: str) -> None:
+    def _mend_geoms(self, root: Element, file: Path) -> None:
         """Leaves out what of the geometry Drake cannot take, unless a body has its mass from it."""
-        options = _compiler(root)
+        options, meshes, paths = _compiler(root), dict[str, Element](), dict[str, str]()
         folder = file.resolve().parent / options.get("meshdir", options.get("assetdir", ""))
-        meshes, used, shells = dict[str, Element](), dict[str, str](), set[str]()
-        for asset in root.iterfind("asset/mesh"):
-            if "file" in asset.attrib:
-                asset.attrib.setdefault("name", Path(asset.get("file", "")).stem)
-                meshes[asset.get("name", "")] = asset
-            if asset.attrib.pop("inertia", "") == "shell":
-                shells.add(asset.get("name", ""))
+        for mesh in root.iterfind("asset/mesh"):
+            mesh.attrib.setdefault("name", Path(mesh.get("file", "")).stem)
+            meshes[mesh.get("name", "")] = mesh
+        shells = {
+            name for name, mesh in meshes.items() if mesh.attrib.pop("inertia", "") == "shell"
+        }
         hulls = {geom.get("mesh") for geom in root.iter("geom") if _collides(geom)}
         joints = "joint", "freejoint"
         moved = [body for body in root.iter("body") if any(one.tag in joints for one in body)]
         moving = {geom for body in moved for geom in body.iter("geom")}
         bodies = [*root.iterfind("worldbody"), *root.iter("body")]
         for body, geom in [(owner, geom) for owner in bodies for geom in owner.findall("geom")]:
-            name, mesh, fault = body.get("name", ""), geom.get("mesh", ""), _fault_of_geom(geom)
             weighs = geom in moving and number_in(geom.get("mass", "1")) != 0.0
             weighs &= options.get("inertiafromgeom") == "true" or body.find("inertial") is None
-            is_seen = self.has_geometry and (self.drawn or _collides(geom))
-            if mesh in meshes and mesh not in used and (weighs or is_seen):
-                own = meshes[mesh].get("file", "")
-                is_hull = self.has_geometry and mesh in hulls
-                used[mesh] = self._mesh(own, folder / own, is_hull, (".obj",))
-                meshes[mesh].set("file", used[mesh])
-            is_refused = mesh in used and not used[mesh]
-            if is_refused or (weighs and mesh in shells):
-                fault = f"is the mesh '{mesh}', which Drake cannot read, or not as a shell"
-            if weighs and fault and (fault != _EMPTY or "mass" in geom.attrib):
-                text = f"body '{name}' has its mass from geometry that {fault}"
-                raise ModelError(f"{text}; give the body an <inertial>")
-            if is_seen and is_refused:
-                self.crossed.add((model, name))
-            elif is_seen and fault:
-                self._leave_out(fault, f"of '{name}'")
-            if fault or not (weighs or is_seen):
+            if not weighs and not (self.has_geometry and (self.drawn or _collides(geom))):
                 body.remove(geom)
+                continue
+            name, asset = geom.get("mesh", ""), ""
+            if name in meshes:
+                if name not in paths:
+                    file_name = meshes[name].get("file", "")
+                    is_hull = self.has_geometry and name in hulls
+                    paths[name] = self._mesh(file_name, folder / file_name, is_hull, (".obj",))
+                    meshes[name].set("file", paths[name])
+                asset = tostring(meshes[name], "unicode")
+            own = {key: value for key, value in geom.items() if key not in ("name", "material")}
+            probe = _PROBES[".xml"].format(tostring(Element("geom", own), "unicode"), asset)
+            is_told, is_shell = paths.get(name) == "", weighs and name in shells
+            if not is_told and not is_shell and _is_read(".xml", probe):
+                continue
+            where = f"of '{body.get('name', '')}'"
+            if weighs:
+                text = f"the mass {where} is that of geometry which Drake does not read"
+                raise ModelError(f"{place_of(geom)}: {text}; give the body an <inertial>")
+            if not is_told:
+                self._leave_out("Drake does not read", where)
+            body.remove(geom)
         for owner in root.iterfind("asset"):
-            for asset in owner.findall("mesh"):
-                if "file" in asset.attrib and not used.get(asset.get("name", "")):
-                    owner.remove(asset)
+            for mesh in owner.findall("mesh"):
+                if not paths.get(mesh.get("name", "")):
+                    owner.remove(mesh)
 
 
 def _apply_defaults(root: Element) -> None:
@@ -465,41 +424,24 @@ def _compiler(root: Element) -> dict[str, str]:
     return {key: value for one in root.iterfind("compiler") for key, value in one.items()}
 
 
-def _first(words: str) -> float:
-    """The first number, and 1 if there is none, or 0."""
-    return number_in([*words.split(), "1"][0]) or 1.0
-
-
 def _collides(geom: Element) -> bool:
     """Whether a geometry of MJCF collides, and is not only drawn."""
     return {geom.get("contype", "1"), geom.get("conaffinity", "1")} != {"0"}
 
 
-def _fault_of_geom(geom: Element) -> str:
-    """Why Drake takes no such shape of MJCF; "" if it does, or if it is a mesh."""
-    kind = "mesh" if "mesh" in geom.attrib else geom.get("type", "sphere")
-    if kind not in _SIZES:
-        return "" if kind == "plane" else _UNREAD
-    sizes = [number_in(word) or 0.0 for word in geom.get("size", "").split()]
-    ends, count = geom.get("fromto", "").split(), sum(_SIZES[kind].values())
-    count = min(count, 1) if ends else 3 if kind == "ellipsoid" else count
-    is_full = len(sizes) >= count and all(size > 0.0 for size in sizes[:count])
-    return "" if is_full and (not ends or ends[:3] != ends[3:]) else _EMPTY
-
-
-def _fault(form: Element, kind: str) -> str:
-    """Why Drake takes no such shape of URDF or SDFormat; "" if it does."""
-    sizes = _SIZES.get(form.tag.removeprefix("drake:"))
-    if sizes is None:
-        return "" if kind == ".sdf" and form.tag in ("plane", "empty") else _UNREAD
-    for key in ("size", "radius", "length", "radii", "a", "b", "c", "scale"):
-        words = (form.get(key) or form.findtext(key) or "").split()
-        if len(words) != sizes.get(key, len(words)) and (words or kind == ".urdf"):
-            return _UNREAD
-        numbers = [number_in(word) or 0.0 for word in words]
-        if any(abs(number) <= _FLAT if key == "scale" else number <= 0.0 for number in numbers):
-            return _EMPTY
-    return ""
+@cache
+def _is_read(kind: str, text: str) -> bool:
+    """Whether Drake makes geometry of a model with a lone shape."""
+    plant, scene_graph, logger = MultibodyPlant(0.0), SceneGraph(), logging.getLogger("drake")
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    was, logger.disabled = logger.disabled, True
+    try:
+        Parser(plant).AddModelsFromString(text, kind)
+    except (RuntimeError, ValueError, SystemExit):  # The last: a failed assertion of Drake.
+        return False
+    finally:
+        logger.disabled = was
+    return scene_graph.model_inspector().num_geometries() > 0
 
 
 @cache
@@ -512,16 +454,14 @@ def _has_hull(mesh: str, changed: int) -> bool:
     return True
 
 
-def _remove(owner: Element, tag: str) -> int:
-    """Removes the children of a tag; returns how many there were."""
-    children = owner.findall(tag)
-    for child in children:
+def _remove(owner: Element, tag: str) -> None:
+    """Removes the children of a tag."""
+    for child in owner.findall(tag):
         owner.remove(child)
-    return len(children)
 
 
 _ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-_PLACES = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])  # Of the entries in a matrix.
+_ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # Their places in the matrix.
 
 
 def nearest_inertia(inertia: FloatArray) -> FloatArray:
@@ -567,15 +507,10 @@ def _mend_inertia(inertial: Element, kind: str) -> str:
         is_possible = False
     if not any(entries) if kilograms == 0.0 else is_possible:
         return ""
-    inertia = np.array(entries)[_PLACES]
+    inertia = np.zeros((3, 3))
+    inertia[_ROWS, _COLUMNS] = inertia[_COLUMNS, _ROWS] = entries
     nearest = nearest_inertia(inertia) if kilograms > 0.0 else np.zeros((3, 3))
-    before, after = np.linalg.eigvalsh(inertia), np.linalg.eigvalsh(nearest)
-    if kilograms > 0.0 and not np.trace(nearest) > 0.0:
-        raise ModelError(
-            f"{place}: the moments of inertia are {before} kg m^2, and near these is none that a "
-            f"body of {kilograms:g} kg can have; mend them"
-        )
-    written = [repr(entry) for entry in nearest[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()]
+    written = [repr(entry) for entry in nearest[_ROWS, _COLUMNS].tolist()]
     if matrix is None:
         inertial.set(key, " ".join(written[: 6 if key == "fullinertia" else 3]))
     else:
@@ -585,6 +520,7 @@ def _mend_inertia(inertial: Element, kind: str) -> str:
                 matrix.set(entry, value)
             else:
                 SubElement(matrix, entry).text = value
-    was, now = (", ".join(f"{d:.3g}" for d in moments) for moments in (before, after))
+    moments = (np.linalg.eigvalsh(one) for one in (inertia, nearest))
+    was, now = (", ".join(f"{d:.3g}" for d in each) for each in moments)
     change = 100.0 * np.linalg.norm(nearest - inertia) / np.linalg.norm(inertia)
     return f"{place}: ({was}) kg m^2, nearest possible ({now}), changed by {change:.2g} %"

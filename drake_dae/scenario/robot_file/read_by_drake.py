@@ -125,6 +125,8 @@ limit@screw: || effort
 dynamics: damping | coulomb_window friction=0
 dynamics@floating: | damping=0
 mimic: joint multiplier offset
+visual: *
+material: name color | *
 transmission: type=simple joint actuator | name mechanicalReduction plugin param
 transmission: | use_simulated_gripper_joint
 actuator: name drake:rotor_inertia drake:gear_ratio drake:controller_gains
@@ -146,12 +148,15 @@ link: | audio_source audio_sink battery projector particle_emitter
 velocity_decay: | linear=0 angular=0
 inertial: pose mass inertia | auto=0 density auto_inertia_params
 inertia: ixx iyy izz ixy ixz iyz
-joint: name type parent child pose axis axis2 screw_thread_pitch thread_pitch drake:rotor_inertia
+joint: name type parent child pose axis axis2 screw_thread_pitch drake:rotor_inertia
 joint: drake:gear_ratio drake:controller_gains drake:mimic
 joint: | sensor plugin physics gearbox_ratio gearbox_reference_body
 joint@revolute,prismatic,continuous,ball,fixed,screw: | axis2
 joint@revolute,prismatic,continuous,ball,fixed,universal: | thread_pitch
 axis axis2: xyz limit dynamics use_parent_model_frame | initial_position
+axis2: | dynamics=never
+visual drake:visual: *
+material: ambient diffuse specular emissive | *
 limit: lower upper effort velocity drake:acceleration | stiffness dissipation
 limit@ball,universal,screw: || lower upper velocity drake:acceleration
 limit@ball,universal: || effort

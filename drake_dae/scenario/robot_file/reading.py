@@ -4,6 +4,7 @@ Loops of joints are cut; the joints at which they are cut become constraints.
 """
 
 import logging
+import re
 import warnings
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.geometry import Box, SceneGraph
+from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import (
     FlattenModelDirectives,
@@ -114,16 +115,14 @@ def _check_mass(plant: MultibodyPlant) -> None:
     plant.SetPositions(context, plant.GetPositions(context) + step)
     values, modes = np.linalg.eigh(plant.CalcMassMatrix(context))
     null = modes[:, values <= 1e-12 * np.max(values, initial=0.0)]  # Zero up to round-off.
-    massless = {
-        name: joint.child_body().name()
+    if massless := [
+        f"{name} (link {joint.child_body().name()})"
         for name, joint in joint_names(plant).items()
         if np.any(np.abs(null[joint.velocity_start() :][: joint.num_velocities()]) > 0.1)
-    }
-    if massless:
+    ]:
         raise ModelError(
-            f"joints that move no mass: {', '.join(massless)}; give their links "
-            f"({', '.join(massless.values())}) an <inertial> with mass and inertia, or lock the "
-            "joints by robot.locked"
+            f"joints that move no mass: {', '.join(massless)}; give the links an <inertial> with "
+            "mass and inertia, or lock the joints by robot.locked"
         )
 
 
@@ -152,13 +151,6 @@ def read_robot(
             else:
                 ProcessModelDirectives(models, parser)
     with _drake():
-        for model, name in sorted(mender.crossed):
-            body = frame_named(plant, _scoped(model, name or "world")).body()
-            for axis in range(3):
-                bar = Box(*np.where(np.arange(3) == axis, 0.06, 0.004))
-                plant.RegisterVisualGeometry(
-                    body, RigidTransform(), bar, f"left_out_{axis}", [0.8, 0.1, 0.1, 1.0]
-                )
         for model, name, child, origin in mender.floating:
             link = frame_named(plant, _scoped(model, child))
             start = plant.GetDefaultFloatingBaseBodyPose(link.body())
@@ -175,14 +167,14 @@ def read_robot(
             facts[joint.index()] = mender.joints.get(("", name)) or mender.joints[model, name]
         _change(plant, robot, facts)
         add_payloads("plant.payloads", payloads, plant)
-        return plant, _cut_loops(plant, facts)
+        return plant, _cut_loops(plant)
 
 
 def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
     """The packages that a robot's file names and that are not found, and what is lost of it."""
     files = RobotFiles(robot, Parser(MultibodyPlant(0.0)).package_map())
-    mender = Mender(files, robot, None, has_geometry=True, drawn=False)
-    with _drake():
+    with TemporaryDirectory() as folder, _drake():
+        mender = Mender(files, robot, Path(folder), has_geometry=False, drawn=False)
         _mended(mender)
     return sorted(files.missing), list(mender.lost)
 
@@ -221,9 +213,9 @@ def _drake(mender: Mender | None = None) -> Iterator[None]:
     here, logger = get_native_id(), logging.getLogger("drake")
 
     def text_of(message: object) -> str:
-        text = str(message)  # The names of copies become those of their files.
-        for copy, file in mender.originals.items() if mender is not None else ():
-            text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
+        text = str(message)
+        if mender is not None:  # The names of copies become those of their files.
+            text = re.sub(rf"(file:)?/*{re.escape(str(mender.folder))}/\d+/", "", text)
         return " ".join(text.split())
 
     def passes(record: logging.LogRecord) -> bool:
@@ -341,12 +333,8 @@ def _unattached(name: str, plant: MultibodyPlant) -> Frame:
         raise ModelError("the world is no part of the robot; name a frame of the robot")
     holding = {joint.child_body().index(): joint.name() for joint in reversed(joints_of(plant))}
     if frame.body().index() in holding:
-        bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-        free = [body.name() for body in bodies if body.index() not in holding]
-        raise ModelError(
-            f"'{name}' is attached already, by joint '{holding[frame.body().index()]}'; unattached "
-            f"bodies: {', '.join(free) or 'none'}"
-        )
+        joint = holding[frame.body().index()]
+        raise ModelError(f"'{name}' is attached already, by joint '{joint}'; name another body")
     return frame
 
 
@@ -443,7 +431,7 @@ def _drive_joints(
         actuator.set_default_rotor_inertia(known.get("armature", 0.0))
 
 
-def _cut_loops(plant: MultibodyPlant, facts: _Facts) -> LoopMakers:
+def _cut_loops(plant: MultibodyPlant) -> LoopMakers:
     """Removes joints until the others form a tree; driven joints only if necessary."""
     driven = {actuator.joint().index() for actuator in _actuators_of(plant)}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
@@ -457,14 +445,12 @@ def _cut_loops(plant: MultibodyPlant, facts: _Facts) -> LoopMakers:
         first, second = (groups[int(body.index())] for body in ends)
         if first == second:
             name = names.get(joint.index(), joint.name())
-            loops[name] = _cut(joint, name, plant, facts.get(joint.index(), {}).get("parent", ""))
+            loops[name] = _cut(joint, name, plant)
         groups = [second if group == first else group for group in groups]
     return loops
 
 
-def _cut(
-    joint: Joint, name: str, plant: MultibodyPlant, parent_frame: str
-) -> Callable[[MultibodyPlant], Constraint]:
+def _cut(joint: Joint, name: str, plant: MultibodyPlant) -> Callable[[MultibodyPlant], Constraint]:
     if not _is_simple(joint):
         raise ModelError(
             f"joint '{name}' closes a loop, and neither turns nor slides; take it out of the file, "
@@ -472,16 +458,6 @@ def _cut(
         )
     frames = joint.frame_on_parent(), joint.frame_on_child()
     poses = [frame.GetFixedPoseInBodyFrame() for frame in frames]
-    # A joint of SDFormat is at its child; of a frame that is its parent, only the body counts.
-    if parent_frame and plant.HasFrameNamed(parent_frame, joint.model_instance()):
-        frame = plant.GetFrameByName(parent_frame, joint.model_instance())
-        gap = frame.GetFixedPoseInBodyFrame().translation() - poses[0].translation()
-        if frame.name() != frame.body().name() and np.linalg.norm(gap) > 1e-6:
-            raise ModelError(
-                f"joint '{name}' closes a loop at its child, {np.linalg.norm(gap):.3g} m from the "
-                f"frame '{parent_frame}' that it names as its parent: of that only the body "
-                f"'{frame.body().name()}' counts. Let <pose> place the joint at the frame"
-            )
     options: dict[str, Any] = {
         "name": name,
         "damping": joint.default_damping(),

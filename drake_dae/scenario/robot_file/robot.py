@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
@@ -158,10 +157,6 @@ class Robot:
         return Path(self.file).name.split(".")[0]
 
 
-_MOST_INCLUDED = 1000
-"""The largest number of files that are included in each other."""
-
-
 class RobotFiles:
     """The file of a robot, and those that it names.
 
@@ -172,7 +167,7 @@ class RobotFiles:
 
     def __init__(self, robot: Robot, packages: PackageMap) -> None:
         self.missing: set[str] = set()
-        self._within, self._included = list[Path](), 0
+        self._within = list[Path]()
         self.packages = packages
         packages.AddPackageXml(str(FOLDER / "models" / "package.xml"))
         for name, folder in robot.packages.items():
@@ -251,13 +246,10 @@ class RobotFiles:
 
     @contextmanager
     def within(self, file: Path) -> Iterator[None]:
-        """Refuses that a file includes itself, while what it includes is read, or too many."""
+        """Refuses that a file includes itself, while what it includes is read."""
         names = " -> ".join(path.name for path in (*self._within, file))
         if file.resolve() in self._within:
             raise ModelError(f"'{file.name}' includes itself: {names}")
-        self._included += 1  # A file may include another one twice, and this one again.
-        if self._included > _MOST_INCLUDED:
-            raise ModelError(f"'{self.main.name}' includes more than {_MOST_INCLUDED} files")
         self._within.append(file.resolve())
         yield
         self._within.pop()
@@ -323,7 +315,7 @@ def drawable(mesh: Path, kinds: tuple[str, ...]) -> Path | None:
     is_scene = mesh.suffix.lower() == ".dae" and ".gltf" in kinds
     try:
         return _converted(is_scene, *check_file(mesh.resolve(), ModelError))
-    except ModelError:  # Meshcat draws a .dae.
+    except Exception:  # trimesh has no exceptions of its own. Meshcat draws a .dae.
         return mesh if is_scene else None
 
 
@@ -331,9 +323,8 @@ def drawable(mesh: Path, kinds: tuple[str, ...]) -> Path | None:
 def _converted(is_scene: bool, name: str, changed: int, size: int) -> Path:
     mesh, folder = Path(name), Path(_folder().name).resolve()
     text = _gltf(mesh) if is_scene else _obj(mesh)
-    copy = (
-        folder / str(len(list(folder.iterdir()))) / f"{mesh.stem}{'.gltf' if is_scene else '.obj'}"
-    )
+    suffix = ".gltf" if is_scene else ".obj"
+    copy = folder / str(len(list(folder.iterdir()))) / f"{mesh.stem}{suffix}"
     copy.parent.mkdir()
     copy.write_bytes(text)
     return copy
@@ -366,23 +357,18 @@ def _obj(mesh: Path) -> bytes:
 
 def _gltf(mesh: Path) -> bytes:
     """The .gltf in m of a .dae. As in ROS, the unit counts, and the upward axis does not."""
-    if find_spec("collada") is None or find_spec("trimesh") is None:
-        raise ModelError(f"'{mesh.name}': pip install 'drake_dae[meshes]' converts it")
     import trimesh
 
     units = [node for node in read_xml(mesh).iter() if node.tag.split(":")[-1] == "unit"]
+    unit = float(units[0].get("meter", "1")) if units else 1.0
     # From z upward to y upward, the convention of .gltf.
     upward = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-    try:
-        unit = float(units[0].get("meter", "1")) if units else 1.0
-        with warnings.catch_warnings():
-            # pycollada sets the shape of arrays, which NumPy 2.5 deprecates.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            scene: Any = trimesh.load_scene(mesh)
-        if scene.is_empty:
-            raise ModelError(f"no mesh in '{mesh.name}'")
-        scene.apply_transform(upward @ np.diag([unit, unit, unit, 1.0]))
-        written: Any = scene.export(file_type="gltf", merge_buffers=True, embed_buffers=True)
-        return bytes(written["model.gltf"])
-    except Exception as error:  # Neither package has exceptions of its own.
-        raise ModelError(f"no mesh in '{mesh.name}': {error}") from None
+    with warnings.catch_warnings():
+        # pycollada sets the shape of arrays, which NumPy 2.5 deprecates.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        scene: Any = trimesh.load_scene(mesh)
+    scene.apply_transform(upward @ np.diag([unit, unit, unit, 1.0]))
+    if scene.is_empty:
+        raise ModelError(f"no mesh in '{mesh.name}'")
+    written: Any = scene.export(file_type="gltf", merge_buffers=True, embed_buffers=True)
+    return bytes(written["model.gltf"])

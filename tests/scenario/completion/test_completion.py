@@ -123,7 +123,7 @@ def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_k
         # The arm reaches 1.5 m at most from its shoulder.
         pytest.param(
             {"references": {"tool": ConstantReference([0.0, 3.0])}},
-            "references: .*tool.z comes to 1.* m, and not to 3 m",
+            "references: .*tool.z = 3",
             marks=pytest.mark.slow,
         ),
         ({"outputs": [PointCoordinates("tool", "y")]}, "references: missing: tool.y"),
@@ -138,7 +138,7 @@ def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_k
                 "forces": ["wall.force", ForceCombination({"wall.force": 2.0}, "twice")],
                 "references": {"wall.force": 10.0, "twice": 20.0},
             },
-            "forces: wall.force, twice .* 1 are",
+            "outputs or forces: .*wall.force, twice",
         ),
     ],
 )

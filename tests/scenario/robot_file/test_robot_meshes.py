@@ -32,7 +32,7 @@ LEFT_OUT = {
 @pytest.mark.parametrize("kind", ["urdf", "sdf", "xml"])
 @pytest.mark.parametrize(("name", "prepare"), LEFT_OUT.values(), ids=LEFT_OUT)
 def test_geometry_stops_no_robot(kind: str, name: str, prepare, tmp_path: Path):
-    """Both shapes go with one line, and a cross of three bars stands in the place of the visual."""
+    """Both shapes go with one line."""
     (tmp_path / "robots").mkdir()
     prepare(tmp_path)
     if kind == "xml" and "://" in name:
@@ -56,7 +56,7 @@ def test_geometry_stops_no_robot(kind: str, name: str, prepare, tmp_path: Path):
     assert [line.count(Path(name).name) for line in lines] == [1] * len(set(lines))
     assert plant.HasModelInstanceNamed("robot")
     assert count(scene_graph, Role.kProximity) == 0
-    assert count(scene_graph, Role.kIllustration) == 3
+    assert count(scene_graph, Role.kIllustration) == 0
 
 
 COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -130,3 +130,27 @@ def test_names_of_colours_mean_what_other_parsers_take_them_for(tmp_path: Path):
         has = properties.HasProperty("phong", "diffuse")
         found.append(properties.GetProperty("phong", "diffuse").r() if has else None)
     assert sorted(found, key=str) == [0.2, 1.0, 1.0, None]
+
+
+@pytest.mark.parametrize("kind", ["urdf", "sdf"])
+def test_no_texture_of_a_file_is_read(kind: str, tmp_path: Path):
+    """It could be any file of this machine, which a page would take along."""
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    box = "<box><size>1 1 1</size></box>" if kind == "sdf" else '<box size="1 1 1"/>'
+    texture = (
+        "<drake:diffuse_map>secret.png</drake:diffuse_map>"
+        if kind == "sdf"
+        else '<texture filename="secret.png"/>'
+    )
+    body = (
+        f'<link name="a"><visual name="v"><geometry>{box}</geometry><material name="m">{texture}'
+        "</material></visual></link>"
+    )
+    drake = 'xmlns:drake="http://drake.mit.edu"'
+    whole = f'<sdf version="1.9" {drake}><model name="r">{body}</model></sdf>'
+    file = tmp_path / f"robot.{kind}"
+    file.write_text(whole if kind == "sdf" else f'<robot name="r" {drake}>{body}</robot>')
+    read(file, scene_graph := SceneGraph())
+    inspector = scene_graph.model_inspector()
+    (one,) = inspector.GetAllGeometryIds(Role.kIllustration)
+    assert not inspector.GetIllustrationProperties(one).HasProperty("phong", "diffuse_map")
