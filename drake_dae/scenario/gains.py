@@ -20,14 +20,15 @@ from drake_dae.dae import (
 )
 from drake_dae.dae.advised_gains import EVERY, MODEL_ERROR, RAMP, Part, settles_along
 from drake_dae.dae.law_model import damping_gains
+from drake_dae.dae.margins import ContactMargins
 from drake_dae.dae.one_direction import DirectionGains
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import JointFriction, Plane, PointOnSurface, RobotModel, velocities_are_rates
 from drake_dae.scenario import parts
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at
-from drake_dae.scenario.model import references_of
+from drake_dae.scenario.model import motion_along, references_of
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario, WrittenConstraint
@@ -47,6 +48,9 @@ _EFFORT = 100.0  # The largest effort in N m of drives without limits in the fil
 _LOAD, _CENTER, _TILT, _PLACE, _COULOMB, _VISCOUS = 0.2, 0.2, 0.15, 0.01, 0.1, 0.25
 PATCH_FORCE = 10.0  # The force in N at which the stiffness of a hydroelastic patch is evaluated.
 _PERIODS = 3  # The oscillations of the contact after the force of a touch has reached its goal.
+# The number of states along the references at which friction is compared with what jams; and the
+# factor of their velocities, so that friction of the model is that of a contact that slides.
+_STATES, _DEVELOPED = 33, 10.0
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
@@ -153,7 +157,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"{estimator.rate:g} 1/s that identifies: {identified}{estimated}"
         f"{outlook}{f'. {expected(chosen, stated)}' if stated else ''}"
     )
-    return Completed(chosen, (note,))
+    told = note, jam(scenario, model, structure, material.friction)
+    return Completed(chosen, tuple(filter(None, told)))
 
 
 def _coefficients(gains: Mapping[str, Sequence[float]]) -> parts.Coefficients:
@@ -376,6 +381,36 @@ def least_damping(structure: Structure, damping: parts.Gains | None) -> float:
         return 0.0
     with at("law.constraint_damping"):
         return float(np.min(np.diag(damping_gains(structure, damping.design()).matrix)))
+
+
+def jam(scenario: Scenario, model: RobotModel, structure: Structure, friction: float | None) -> str:
+    """Where friction of the plant makes contacts jam along the references, as a sentence.
+
+    Along a normal that hardly moves, friction that the law does not know may move the tool into
+    the surface by more than the normal force moves it out: mu A_nt > A_nn, the Painleve paradox.
+    """
+    system = model.dae
+    if scenario.task is not None or not (system.frictional_contacts and friction):
+        return ""
+    try:
+        motion = motion_along(scenario, model, structure, _STATES)
+    except DrakeDaeError:  # Wrong references and starts are reported where they are used.
+        return ""
+    if not motion.times.size:
+        return ""
+    states = motion.states.copy()
+    states[:, model.links.q.numel() :] *= _DEVELOPED
+    margins = ContactMargins(system, structure.elimination.constraint_matrix)
+    margin = margins.along(motion.times, states, motion.parameters)
+    if not margin.lowest <= friction:
+        return ""
+    name = max(margin.critical_friction, key=margin.critical_friction.__getitem__)
+    return (
+        f"no gains are stable here: with {name} of {margin.lowest:.2g} or more the contact jams at "
+        f"t = {margin.time:.3g} s (the Painleve paradox: friction presses the tool on by more than "
+        f"the surface presses it back), and the plant has {friction:g}; start in a posture from "
+        "which the tool moves more easily along the normal, or reduce the friction"
+    )
 
 
 def with_lasting_touches(

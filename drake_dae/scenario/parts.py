@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Annotated, ClassVar, cast
 
 import numpy as np
@@ -15,10 +16,10 @@ from pydrake.systems.framework import Context
 from drake_dae import systems
 from drake_dae.arrays import unknown_name
 from drake_dae.dae import ConstraintStructure, GainDesign, gain_coefficients, gain_matrices, poles
-from drake_dae.errors import GainError, ModelError
+from drake_dae.errors import DrakeDaeError, GainError, ModelError
 from drake_dae.references import Reference
 from drake_dae.robots import FrictionCone, RobotModel
-from drake_dae.scenario.form import Positive, at
+from drake_dae.scenario.form import Positive, at, expected
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Payload, Robot
 from drake_dae.systems import Observing, Plant, PointMaterial
@@ -41,7 +42,8 @@ class ScenarioPlant(ABC):
 
     carries: ClassVar[bool] = False
     """Whether the plant has these itself. Else a model has the payloads and disturbances, and
-    numbers are set in a context."""
+    numbers are set in a context, or, if it does not adjust, the plant is made anew for each."""
+    adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
     """The keys of numbers that `begin` sets in a context."""
 
@@ -116,6 +118,42 @@ class CompliantContact(PointMaterial, ScenarioPlant):
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         with at("plant or plant.parameters"):  # Whose numbers are set in a context.
             return systems.CompliantPlant(model, self, structure=structure)
+
+
+@dataclass(frozen=True)
+class OwnPlant(ScenarioPlant):
+    """The plant is your own class that follows the contract of `drake_dae.Plant`.
+
+    It is called with the robot and its structure, as `maker(model, structure)`. Running such a
+    scenario imports the module, found by PYTHONPATH, also in the processes of a sweep: use only
+    files from people whose code you trust.
+
+    Attributes:
+        maker: The module and the class in it, as "my_plants:SpringyPlant".
+    """
+
+    maker: Annotated[
+        str,
+        Field(pattern=r"^[^:]+:[^\W\d]\w*$"),
+        expected("a module and a class in it, as my_plants:SpringyPlant"),
+    ]
+    adjusts: ClassVar[bool] = False
+
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        module, _, name = self.maker.partition(":")
+        with at("plant.maker"):
+            try:
+                plant = getattr(import_module(module), name)(model, structure)
+            except DrakeDaeError:
+                raise
+            except Exception as error:
+                what = f"{type(error).__name__}: {error}"
+                raise ModelError(f"'{self.maker}' cannot be loaded and made: {what}") from error
+            if not isinstance(plant, Plant):
+                raise ModelError(
+                    f"'{self.maker}' makes no plant that keeps the contract of drake_dae.Plant"
+                )
+            return plant
 
 
 @dataclass(frozen=True)

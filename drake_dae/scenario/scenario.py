@@ -242,7 +242,9 @@ FAMILIES: dict[type, Family] = {
     Stage: _family(robots, "FlexibleJoints DcMotors ElectrohydraulicServos"),
     Load: _family(robots, "KnownForce JointFriction"),
     Reference: Family(_REFERENCES, float),
-    parts.ScenarioPlant: _family(parts, "IdealConstraints MultibodyPlant CompliantContact"),
+    parts.ScenarioPlant: _family(
+        parts, "IdealConstraints MultibodyPlant CompliantContact OwnPlant"
+    ),
     parts.Poles: _family(parts, "Poles Coefficients Matrices"),
     Phase: _family(phases, "Approach Press Move Dwell Release Retreat"),
 }

@@ -41,10 +41,13 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
         numbers["plant.parameters"] = dict(of_plant.parameters)
         numbers["plant.payloads"] = {f"{p.name}.mass": p.mass for p in of_plant.payloads}
         numbers["plant.disturbances"] = {f"plant_disturbance_{i}.force": d.force for i, d in pushes}
+    parameters = plant.parameters(at_plant)
     for key, values in numbers.items():
         with at(key):
             for name, value in values.items():
-                plant.set_parameter(at_plant, name, value)
+                # A user's own plant may not let numbers be set, and has been made with these.
+                if not np.array_equal(parameters[plant.dae.parameter_slice(name)], np.ravel(value)):
+                    plant.set_parameter(at_plant, name, value)
     with at("plant"):
         of_plant.begin(plant, at_plant)
     force, encoders, gains = scenario.sensors.force, scenario.sensors.encoders, scenario.law.gains

@@ -300,6 +300,7 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
     patterns += [rf"plant\.{re.escape(name)}" for name in numbers]
     if not plant.carries:
         patterns.append(r"plant\.parameters(\..+)?")
+    if plant.adjusts and not plant.carries:
         patterns.append(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
     if not (isinstance(base.law.gains, Matrices) or is_advised or base.task is not None):
         patterns.append(r"law\.gains\..+")

@@ -110,6 +110,16 @@ def test_a_record_without_rows_or_the_signals_of_its_loop_is_one_line(kind, rows
     assert error_line(capsys)
 
 
+@pytest.mark.parametrize("text", ["1 / 0", "class P:\n    def __init__(self, *_):\n        1 / 0"])
+def test_a_plant_of_ones_own_that_fails_is_one_line(text, tmp_path, monkeypatch, capsys):
+    name = f"plants_{abs(hash(text))}"
+    (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    own = ["--set", f"plant=!OwnPlant {{maker: '{name}:P'}}"]
+    assert main(["simulate", "two_link_wall", *own, "--out", str(tmp_path / "run")]) == 1
+    assert "ZeroDivisionError" in error_line(capsys)
+
+
 NO_HOME = """
 import os, pwd, sys
 def unknown(uid): raise KeyError(uid)

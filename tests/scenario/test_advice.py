@@ -215,6 +215,21 @@ def test_nothing_is_advised_behind_springs():
     assert "wall_flexible_contact" in str(told.value)
 
 
+def test_friction_that_jams_the_contact_is_told():
+    """mu A_nt = A_nn at the start, which the path hardly leaves, in one direction of sliding."""
+    wave = "!Sinusoids {offset: 0.3, amplitudes: [0.005], frequencies: [3]}"
+    moves = f"references={{tool.z: {wave}, wall.force: 20}}"
+    given = "constraints.0.friction=0", "duration=2.1", moves
+    completed, loop = build_completed(two_link(*given, "plant.friction=1.3"))
+    known = numbers("two_link", loop.plant.structure.states[0][:2], np.zeros(2))
+    moved = np.linalg.solve(known.mass, known.constraint_jacobian[0])
+    critical = abs(known.constraint_jacobian[0] @ moved / (known.output_jacobian[0] @ moved))
+    told = re.search(r"wall\.friction of (\S+) or more", completed.notes[1])
+    assert float(told[1]) == pytest.approx(critical, rel=0.1)
+    free, _ = build_completed(two_link(*given, f"plant.friction={0.8 * critical}"))
+    assert len(free.notes) == 1
+
+
 @pytest.mark.slow
 def test_gains_without_a_margin_are_told():
     """Of half the stiffness, for which twice of it are stable; none are a problem before a run."""

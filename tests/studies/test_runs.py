@@ -5,6 +5,7 @@ import pytest
 from runs import run_scenario, scenario, some
 
 from drake_dae.analysis import robot_limits
+from drake_dae.errors import ScenarioError
 from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
 from drake_dae.studies.study import Outcome, figures_of
 from drake_dae.studies.sweep import Runner, structure_of
@@ -162,3 +163,13 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
         assert bool(result.figures) == (outcome in (Outcome.FAILED, Outcome.FINISHED))
         if outcome is Outcome.FAILED:
             assert 0.0 < result.figures["end [s]"] < 2.0
+
+
+UNTRACED = "plant=!OwnPlant {maker: 'members:SpringyPlant'}"
+
+
+def test_what_no_rollout_has_is_reported():
+    base = scenario_data(scenario("two_link_wall", *SHORT, UNTRACED))
+    Runner(base).check({})
+    with pytest.raises(ScenarioError, match="Simulator"):
+        Runner(base, 1.0).check({})

@@ -1,7 +1,10 @@
 """The rules of `Plant`, on every member: those of the package and one of `members`."""
 
+import os
 from functools import cache
+from pathlib import Path
 
+import members
 import numpy as np
 import pytest
 from arms import arm, fixed_step
@@ -12,9 +15,10 @@ from pydrake.systems.primitives import ConstantVectorSource
 import drake_dae as dd
 from drake_dae.diagrams.closed_loop import log_steps
 from drake_dae.diagrams.record import Record
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.studies.study import Outcome
 from drake_dae.systems import PointMaterial
 from drake_dae.systems.plant import Plant
 
@@ -220,3 +224,37 @@ def test_rule_8_friction(plant):
     found = plant.friction(context)
     assert set(found) <= set(names)
     assert all(value >= 0.0 for value in found.values())
+
+
+@pytest.mark.slow
+def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monkeypatch):
+    """Named in the file alone. Its errors are those of the package's plant, to the accuracy."""
+    places = [str(Path(members.__file__).parent), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, places)))  # Of other processes.
+    settings = ["duration=0.1", "integrator.accuracy=1e-8"]
+    path = find_scenario("two_link_wall")
+    changes = [{"start.errors": {"tool.z": 0.05}}, {"start.errors": {"tool.z": 0.02}}]
+    found = []
+    for kind in ("!OwnPlant {maker: 'members:SpringyPlant'}", "!IdealConstraints {}"):
+        scenario = dd.load_scenario(path, [*settings, f"plant={kind}"])
+        study = dd.sweep(scenario, changes, tmp_path / f"{len(found)}.db", workers=1)
+        assert {run.outcome for run in study.results} == {Outcome.FINISHED}, study.results
+        found.append([run.figures["largest error of tool.z [m]"] for run in study.results])
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("maker", "told"),
+    [
+        ("members", "plant.maker: "),
+        ("no_such_module:Plant", r"plant\.maker: .*'no_such_module:Plant'"),
+        ("members:NoSuchPlant", r"plant\.maker: .*'NoSuchPlant'"),
+    ],
+)
+def test_a_plant_that_cannot_be_loaded_is_refused_with_its_key(maker, told):
+    with pytest.raises(ScenarioError, match=told):
+        dd.build_scenario(
+            dd.load_scenario(
+                find_scenario("two_link_wall"), [f"plant=!OwnPlant {{maker: '{maker}'}}"]
+            )
+        )
