@@ -237,6 +237,7 @@ class Mender:
         kinds = {joint.get("name", ""): joint.get("type") for joint in joints}
         still = {name for name in kinds if self.joints[model, name].get("effort") == 0.0}
         still |= {name for name, kind in kinds.items() if kind in _OF_MANY_AXES}
+        moving = {name for name, kind in kinds.items() if kind != "fixed"}
         count = Counter[str]()
         for transmission in root.findall("transmission"):
             driven = {joint.get("name", "") for joint in transmission.iterfind("joint")}
@@ -244,7 +245,7 @@ class Mender:
             for name in driven & still:
                 text = f"joint '{name}': its effort is 0, or it has more than one axis"
                 self.lose("transmission/joint", text)
-            if not has_type or driven & still:
+            if not has_type or not driven & moving or driven & still:
                 root.remove(transmission)
                 continue
             for actuator in transmission.iterfind("actuator"):  # Their names may be equal.
