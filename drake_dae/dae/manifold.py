@@ -193,7 +193,10 @@ class Manifold:
                     "constraints contradict each other, or start away from this state"
                 )
             raise self._failed(found, p, why)
-        return found
+        step = step_from(found, found, p)[0]
+        if converged or not np.isfinite(step).all():  # As where gradients are dependent.
+            return found
+        return polished(found, step, lambda x: step_from(x, found, p)[0], scale)
 
     def _downhill(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """The end of least-squares steps, each of which decreases the residual."""

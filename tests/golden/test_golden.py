@@ -89,8 +89,9 @@ def test_the_analysis_is_as_recorded(name):
     assert found.keys() == wanted.keys()
     for key, value in wanted.items():
         if isinstance(value, float):  # Searched along paths, in steps.
-            # Round-off of other libraries decides in which step the descent ends, within 1 %.
-            descended = OTHER_DRAKE and ".critical_friction." in key
+            # Round-off of libraries and processors decides in which step the descent to the least
+            # critical friction ends, within 1 %.
+            descended = ".critical_friction." in key or ".contact_margin." in key
             rel = 1e-2 if descended else 1e-6
             assert found[key] == pytest.approx(value, rel=rel, abs=1e-9), key
         else:

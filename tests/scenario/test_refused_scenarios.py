@@ -59,9 +59,14 @@ LINE, GENTLE = (
 )
 DWELL = "!Dwell {name: away, until: [{of: signal, name: go, above: 0.5}]}"
 ENCODERS = "sensors.encoders={position_noise: 1.0e-5}", "estimator={rate: 60, state_rate: 200}"
+ROD = (
+    "!FixedDistance {frame_a: world, point_a: [0, 0, 0], frame_b: tool, point_b: [0, 0, 0], "
+    "length: 0}"
+)
 # Scenario -> its settings -> parts of the message, between which "|" stands.
 REFUSED = {
     "two_link_wall": {
+        f"constraints.0={ROD}": "constraints.0: |'rod.length'",
         "forces=[wall]": "forces.0: |'wall'|wall.force",
         # Settings and the run.
         "duration": "--set duration: ",
@@ -140,7 +145,6 @@ REFUSED = {
         "exogenous={plate.positio: []}": "exogenous: |'plate.positio'",
         "exogenous={plate.rpy: []}": "plate.rpy: |3|0",
     },
-    "rod": {"constraints.0.length=0": "constraints.0: |'rod.length'"},
     "task": {
         "task.phases=[]": "task: ",
         "task.phases.0.speed=-1": "task.phases.0: |speed|-1",

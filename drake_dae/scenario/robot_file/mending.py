@@ -195,6 +195,7 @@ class Mender:
         words = ("" if end is None else end.get("link") or end.text or "" for end in ends)
         parent, child = map(str.strip, words)
         of_file, is_placed = self.joints[model, name], parent == "world" and child in self.placed
+        of_file["parent"] = parent
         if kind == "floating" or (kind == "fixed" and is_placed):
             owner.remove(joint)
         if kind == "floating" and not is_placed:

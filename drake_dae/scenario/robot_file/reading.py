@@ -167,7 +167,7 @@ def read_robot(
             facts[joint.index()] = mender.joints.get(("", name)) or mender.joints[model, name]
         _change(plant, robot, facts)
         add_payloads("plant.payloads", payloads, plant)
-        return plant, _cut_loops(plant)
+        return plant, _cut_loops(plant, facts)
 
 
 def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
@@ -431,7 +431,7 @@ def _drive_joints(
         actuator.set_default_rotor_inertia(known.get("armature", 0.0))
 
 
-def _cut_loops(plant: MultibodyPlant) -> LoopMakers:
+def _cut_loops(plant: MultibodyPlant, facts: _Facts) -> LoopMakers:
     """Removes joints until the others form a tree; driven joints only if necessary."""
     driven = {actuator.joint().index() for actuator in _actuators_of(plant)}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
@@ -445,12 +445,14 @@ def _cut_loops(plant: MultibodyPlant) -> LoopMakers:
         first, second = (groups[int(body.index())] for body in ends)
         if first == second:
             name = names.get(joint.index(), joint.name())
-            loops[name] = _cut(joint, name, plant)
+            loops[name] = _cut(joint, name, plant, facts.get(joint.index(), {}).get("parent", ""))
         groups = [second if group == first else group for group in groups]
     return loops
 
 
-def _cut(joint: Joint, name: str, plant: MultibodyPlant) -> Callable[[MultibodyPlant], Constraint]:
+def _cut(
+    joint: Joint, name: str, plant: MultibodyPlant, parent_frame: str
+) -> Callable[[MultibodyPlant], Constraint]:
     if not _is_simple(joint):
         raise ModelError(
             f"joint '{name}' closes a loop, and neither turns nor slides; take it out of the file, "
@@ -458,6 +460,16 @@ def _cut(joint: Joint, name: str, plant: MultibodyPlant) -> Callable[[MultibodyP
         )
     frames = joint.frame_on_parent(), joint.frame_on_child()
     poses = [frame.GetFixedPoseInBodyFrame() for frame in frames]
+    # A joint of SDFormat is at its child; of a frame that is its parent, only the body counts.
+    if parent_frame and plant.HasFrameNamed(parent_frame, joint.model_instance()):
+        frame = plant.GetFrameByName(parent_frame, joint.model_instance())
+        gap = frame.GetFixedPoseInBodyFrame().translation() - poses[0].translation()
+        if frame.name() != frame.body().name() and np.linalg.norm(gap) > 1e-6:
+            raise ModelError(
+                f"joint '{name}' closes a loop at its child, {np.linalg.norm(gap):.3g} m from the "
+                f"frame '{parent_frame}' that it names as its parent: of that only the body "
+                f"'{frame.body().name()}' counts. Let <pose> place the joint at the frame"
+            )
     options: dict[str, Any] = {
         "name": name,
         "damping": joint.default_damping(),

@@ -15,7 +15,7 @@ from vendors import joint, link, panda, robot, write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.robot_file.reading import finalize, read_robot
+from drake_dae.scenario.robot_file.reading import finalize, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot
 
 # The collision meshes of the panda are left out.
@@ -170,3 +170,27 @@ def test_effort_limits_are_those_of_the_scenario_or_of_the_file(
     plant, _ = read_robot(Robot(str(tmp_path / "robot.urdf"), actuators=actuators))
     finalize(plant)
     assert plant.GetEffortUpperLimits() == [wanted]
+
+
+MASS = "<inertial><mass>1</mass></inertial>"
+TURNS = (
+    '<joint name="{}" type="revolute"><parent>{}</parent><child>{}</child>{}<axis><xyz>0 1 0</xyz>'
+)
+TURNS += "</axis></joint>"
+OPEN = f"""<sdf version="1.9"><model name="m"><link name="a">{MASS}</link>
+<link name="b"><pose>0 0 1 0 0 0</pose>{MASS}</link><link name="c"><pose>1 0 0 0 0 0</pose>{MASS}
+</link><frame name="tip" attached_to="a"><pose>1.28 0 0 0 0 0</pose></frame>
+<joint name="hold" type="fixed"><parent>world</parent><child>a</child></joint>
+{TURNS.format("one", "a", "b", "")}{TURNS.format("two", "b", "c", "")}
+{TURNS.format("three", "tip", "c", "POSE")}</model></sdf>"""
+
+
+def test_a_loop_whose_named_parent_frame_is_elsewhere_is_told(tmp_path):
+    """SDFormat puts a joint at its child, and takes only the body of a frame that is its parent."""
+    file = tmp_path / "loop.sdf"
+    file.write_text(OPEN.replace("POSE", ""))
+    with pytest.raises(ScenarioError, match=r"'three'.* 0\.28 m .*'tip'"):
+        robot_links(Robot(str(file)), SceneGraph())
+    file.write_text(OPEN.replace("POSE", "<pose relative_to='tip'/>"))
+    _, (loop,) = robot_links(Robot(str(file)), SceneGraph())
+    assert loop.name == "three"
