@@ -75,8 +75,9 @@ def damping_gains(structure: Structure, damping: GainDesign | FeedbackGains) -> 
 def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
     """The system as a sampled law sees it: its damping by the speed at which the control acts.
 
-    A sampled control acts on average by the latency T later, delay + period / 2, when the speed is
-    v + T v'. Hence the damping -D v of the model, which a law compensates with the measured v, is
+    A sampled control acts on average by the latency T later, delay + (period + step) / 2 with the
+    step of a plant, when the speed is v + T v'. Hence the damping -D v of the model, which a law
+    compensates with the measured v, is
 
         M v' + D (v + T v') = u,    or    (M + T D) v' + D v = u.
 

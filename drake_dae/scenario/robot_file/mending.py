@@ -1,7 +1,8 @@
 """Copies of a robot's files, mended so that Drake's parser reads them as their authors mean them.
 
 A copy has possible inertias, and geometry that can be read and drawn; it lacks what is not read.
-What changed on the way is collected, and so is what is lost.
+What changed on the way is collected, and so is what is lost, for which `reading` refuses the robot
+unless `leave_out` names it.
 """
 
 import logging

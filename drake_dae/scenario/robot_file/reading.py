@@ -242,7 +242,7 @@ def _told(lost: Mapping[str, list[str]]) -> str:
     ways = [f"leave_out: [{', '.join(lost)}] under robot"]
     ways += [hint for word, hint in _REMEDIES.items() if any(word in part for part in lost)]
     return (
-        f"the equations would lack what Drake does not read of the file: {text}. Mend it, or write "
+        f"the equations would lack what Drake does not take of the file: {text}. Mend it, or write "
         f"{'; '.join(dict.fromkeys(ways))}"
     )
 
