@@ -128,7 +128,8 @@ def _checked_constraints(
         )
         raise ScenarioError(("robot.actuators", text))
     _outputs(scenario, [*constraints, *loops], links)
-    attached = each("actuation", scenario.actuation, lambda stage: stage.attach(links))
+    stages = scenario.actuation if links.actuator_signals else ()  # Else the model refuses them.
+    attached = each("actuation", stages, lambda stage: stage.attach(links))
 
     def rows(force: str | ForceOutput) -> Any:
         return robots.force_rows(robots.as_force_outputs([force], bound), bound, links)
