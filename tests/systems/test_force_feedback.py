@@ -84,28 +84,6 @@ def test_measured_force_removes_the_static_error_behind_motors(stage):
     np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
 
 
-def test_with_a_right_model_measured_force_changes_nothing():
-    """lambda is the model's lambda then: the law is the same to round-off."""
-    for stages in ([MOTORS], [dd.FlexibleJoints(8000.0, inertia=1.0)]):
-        model = touching("two_link", stages)
-        plain = dd.TrackingLaw(model.dae, dd.poles(-4.0))
-        fed = dd.TrackingLaw(
-            model.dae, dd.poles(-4.0), structure=plain.structure, measured_force=True
-        )
-        plant = dd.RobotPlant(model, structure=plain.structure)
-        context = plant.CreateDefaultContext()
-        random = np.random.default_rng(5)
-        for state in plain.structure.states[:4]:
-            plant.set_state(context, state)
-            force = plant.GetOutputPort("constraint_force").Eval(context)
-            reference = random.standard_normal(len(plain.reference_signals))
-            np.testing.assert_allclose(
-                fed.control(state, reference, measured_force=force),
-                plain.control(state, reference),
-                rtol=1e-8,
-            )
-
-
 @pytest.mark.equation(59)
 def test_law_59_with_measured_force():
     """u of (59) less u without Gbar is J^T Gbar (lambda - r_2)."""

@@ -157,6 +157,9 @@ class Robot:
         return Path(self.file).name.split(".")[0]
 
 
+_MOST_INCLUDED = 1000
+
+
 class RobotFiles:
     """The file of a robot, and those that it names.
 
@@ -167,7 +170,7 @@ class RobotFiles:
 
     def __init__(self, robot: Robot, packages: PackageMap) -> None:
         self.missing: set[str] = set()
-        self._within = list[Path]()
+        self._within, self._included = list[Path](), 0
         self.packages = packages
         packages.AddPackageXml(str(FOLDER / "models" / "package.xml"))
         for name, folder in robot.packages.items():
@@ -246,10 +249,13 @@ class RobotFiles:
 
     @contextmanager
     def within(self, file: Path) -> Iterator[None]:
-        """Refuses that a file includes itself, while what it includes is read."""
+        """Refuses that a file includes itself, while what it includes is read, or too many."""
         names = " -> ".join(path.name for path in (*self._within, file))
         if file.resolve() in self._within:
             raise ModelError(f"'{file.name}' includes itself: {names}")
+        self._included += 1  # A file may include another one twice, and this one again.
+        if self._included > _MOST_INCLUDED:
+            raise ModelError(f"'{self.main.name}' includes more than {_MOST_INCLUDED} files")
         self._within.append(file.resolve())
         yield
         self._within.pop()
