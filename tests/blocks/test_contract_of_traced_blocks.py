@@ -7,13 +7,12 @@ import numpy as np
 import polishing
 import pytest
 from actuated import actuated
-from alone import alone
 from arms import arm, law
 from blocks_of_users import Counter_
 from pydrake.symbolic import Variable, if_then_else, logical_and
 from pydrake.systems import primitives as drake
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, PortDataType
 from runs import some
 
 import drake_dae as dd
@@ -140,6 +139,33 @@ SYSTEMS = {
     "a diagram of primitives": lambda: drake.StateInterpolatorWithDiscreteDerivative(2, 0.1),
     "a template whose updates begin later": lambda: Counter_[None](0.1, 0.03),
 }
+
+
+def alone(system):
+    """A diagram of one system, all ports exported, and a context with random numbers in it.
+
+    An input port has the name "in <index>" there, an output port with vectors "out <index>".
+    """
+    builder, random = DiagramBuilder(), np.random.default_rng(0)
+    builder.AddSystem(system)
+    for i in range(system.num_input_ports()):
+        if system.get_input_port(i).get_data_type() == PortDataType.kVectorValued:
+            builder.ExportInput(system.get_input_port(i), f"in {i}")
+    for i in range(system.num_output_ports()):
+        if system.get_output_port(i).get_data_type() == PortDataType.kVectorValued:
+            builder.ExportOutput(system.get_output_port(i), f"out {i}")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    context.SetTime(0.4)
+    for i in range(diagram.num_input_ports()):
+        port = diagram.get_input_port(i)
+        port.FixValue(context, random.normal(size=port.size()))
+    state = context.get_mutable_continuous_state_vector()
+    state.SetFromVector(random.normal(size=state.size()))
+    discrete = context.get_mutable_discrete_state()
+    for i in range(discrete.num_groups()):
+        discrete.get_mutable_vector(i).SetFromVector(random.normal(size=discrete.value(i).size))
+    return diagram, context
 
 
 def in_context(name):

@@ -8,7 +8,6 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 from scenario_texts import run, two_link
-from two_arms import GRASP
 
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
@@ -127,22 +126,6 @@ def test_settings_reach_names_with_dots_in_lists():
     assert phase.references == {"tool.z": 0.4}
 
 
-def test_outputs():
-    """The outputs of seven_joint_wall in other words."""
-    settings = [
-        "outputs.0=!SurfaceCoordinates {constraint: wall}",
-        "start.errors={wall.across: 0.02}",
-        "references={wall: !Constant {values: [0, 0.6]}, tool.z_axis: 0, 'joint3, joint7': 0, "
-        "wall.force: 20}",
-    ]
-    loop, context = dd.build_scenario(dd.load_scenario(find_scenario("seven_joint_wall"), settings))
-    names = [signal.name for signal in loop.plant.dae.output_signals]
-    assert names[:3] == ["wall.along", "wall.across", "tool.z_axis.y"]
-    assert names[3:] == ["tool.z_axis.z", "joint3", "joint7", "wall.force"]
-    error = loop.diagram.GetOutputPort("tracking_error").Eval(context)
-    np.testing.assert_allclose(error, [0, 0.02, 0, 0, 0, 0, 0], atol=1e-9)
-
-
 def test_a_run_begins_at_its_start_time_with_the_errors_there():
     scenario = two_link("integrator.start_time=3", "duration=0.5")
     _, record, distance = run(scenario)
@@ -152,21 +135,6 @@ def test_a_run_begins_at_its_start_time_with_the_errors_there():
     assert record["tracking_error"][0, 0] == pytest.approx(0.05, abs=1e-9)
     # The accuracy is 1e-8 in a step.
     assert np.max(distance) < 1e-6
-
-
-def test_weld():
-    """The shipped scenario has the weld of tests/support/two_arms.py."""
-    weld = dd.load_scenario(find_scenario("two_arms")).constraints[0].make(())
-    assert (weld.frame_a, weld.frame_b, weld.name) == (GRASP.frame_a, GRASP.frame_b, "grasp")
-    np.testing.assert_allclose(
-        weld.pose.GetAsMatrix4(), GRASP.pose.GetAsMatrix4(), rtol=0, atol=1e-15
-    )
-    # A pose that is left out is that of frames that coincide.
-    plain = dd.load_scenario(
-        find_scenario("two_arms"),
-        ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
-    )
-    assert plain.constraints[0] == WeldedFramesForm("left::tool", "right::tool", Pose())
 
 
 TILTED = (
