@@ -219,19 +219,6 @@ def test_closed_loops_have_the_assigned_poles(name, kind):
     assert_poles(loop, context, np.concatenate([*assigned.values()]), 2, 2e-9)
 
 
-def test_a_closed_loop_keeps_its_zero_dynamics():
-    """With the rod force held at v, m y'' = v y - m g: an oscillation with w^2 = -v / m."""
-    problem = PROBLEMS["pendulum_tension"]()
-    mass, length, gravity, angle = 2.0, 0.8, 9.81, 0.6
-    force = -mass * gravity / (length * np.cos(angle))
-    design = dd.TrackingLaw(problem.system, poles(-1.0))
-    loop = dd.make_closed_loop(dd.DaePlant(problem.system), design, [dd.ConstantReference(force)])
-    context = loop.diagram.CreateDefaultContext()
-    context.SetContinuousState([length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0])
-    swing = 1j * np.sqrt(-force / mass)
-    assert_poles(loop, context, [swing, -swing], 2, 1e-12)
-
-
 def test_failures_name_time_and_state():
     found = arm("two_link")
     controller = dd.TrackingController(law("two_link")).ToAutoDiffXd()

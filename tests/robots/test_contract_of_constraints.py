@@ -35,7 +35,6 @@ from drake_dae import (
     RevoluteLoopJoint,
     RollingWheel,
 )
-from drake_dae.errors import ModelError
 from drake_dae.robots import (
     Constraint,
     ConstraintSet,
@@ -431,8 +430,3 @@ def test_it_measures_the_tilt_and_has_no_second_zero(angle):
     constraint = AxisNormalToSurface("body", Plane((0, 0, 0), (0, 0, 1)))
     phi, _ = rows(constraint, links, [0.3, 0.1, angle])
     np.testing.assert_allclose(phi, [0.0, -2.0 * np.tan(angle / 2.0)], atol=1e-13)
-
-
-def test_an_axis_of_no_length_is_refused():
-    with pytest.raises(ModelError, match="axis"):
-        AxisNormalToSurface("tool", Plane((0, 0, 0), (0, 0, 1)), (0.0, 0.0, 0.0))

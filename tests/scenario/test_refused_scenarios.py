@@ -1,7 +1,8 @@
 """What a scenario refuses: the key, the value and what would be right, all problems at once."""
 
 import pytest
-from scenario_texts import two_link, written
+from runs import scenario
+from scenario_texts import written
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
@@ -36,7 +37,7 @@ def test_texts(text, words, tmp_path):
     path = tmp_path / "s.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     if words is None:
-        assert load_scenario(path) == two_link()
+        assert load_scenario(path) == scenario("two_link_wall")
         return
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path)

@@ -7,7 +7,8 @@ import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
-from scenario_texts import run, two_link
+from runs import scenario as shipped
+from scenario_texts import run
 
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
@@ -80,7 +81,7 @@ def test_files_in_settings_of_a_shipped_scenario_are_in_the_working_directory(
 ):
     (tmp_path / "path.csv").write_text("time,y\n0,0\n1,0.1\n2,0\n")
     monkeypatch.chdir(tmp_path)
-    chosen = two_link("references={tool.y: !Csv {file: path.csv, columns: [y]}}")
+    chosen = shipped("two_link_wall", "references={tool.y: !Csv {file: path.csv, columns: [y]}}")
     assert chosen.references["tool.y"].table.shape == (3, 2)
 
 
@@ -88,9 +89,9 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
     for folder in ("robots", "scenarios"):
         (tmp_path / folder).mkdir()
     (tmp_path / "robots" / "arm.urdf").write_text(dd.shipped_model("two_link_arm.urdf").read_text())
-    text, shipped = find_scenario("two_link_wall").read_text(), "package://drake_dae_models/"
+    text, models = find_scenario("two_link_wall").read_text(), "package://drake_dae_models/"
     away = tmp_path / "scenarios" / "away.yaml"
-    away.write_text(text.replace(f"{shipped}two_link_arm.urdf", "../robots/arm.urdf"))
+    away.write_text(text.replace(f"{models}two_link_arm.urdf", "../robots/arm.urdf"))
     monkeypatch.chdir("/")
     scenario = dd.load_scenario(away, ["duration=0.1"])
     assert scenario.robot.file == str((tmp_path / "robots" / "arm.urdf").resolve())
@@ -117,17 +118,17 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
     ],
 )
 def test_settings(setting, read):
-    assert read(two_link(setting))
+    assert read(shipped("two_link_wall", setting))
 
 
 def test_settings_reach_names_with_dots_in_lists():
     task = "task={phases: [!Move {references: {tool.z: 0.3}, duration: 1}]}"
-    (phase,) = two_link(task, "task.phases.0.references.tool.z=0.4").task.phases
+    (phase,) = shipped("two_link_wall", task, "task.phases.0.references.tool.z=0.4").task.phases
     assert phase.references == {"tool.z": 0.4}
 
 
 def test_a_run_begins_at_its_start_time_with_the_errors_there():
-    scenario = two_link("integrator.start_time=3", "duration=0.5")
+    scenario = shipped("two_link_wall", "integrator.start_time=3", "duration=0.5")
     _, record, distance = run(scenario)
     assert record.time[0] == 3.0
     assert record.time[-1] == 3.5
@@ -145,11 +146,11 @@ TILTED = (
 
 def test_bounds_of_parameters_are_those_at_which_the_structure_is_looked_at():
     """At a = 0 the wall is y = 0, along which the whole arm moves: A(x) is zero."""
-    loop, _ = dd.build_scenario(two_link(TILTED, "bounds={wall.a: [0.5, 2]}"))
+    loop, _ = dd.build_scenario(shipped("two_link_wall", TILTED, "bounds={wall.a: [0.5, 2]}"))
     for system in (loop.plant.dae, loop.controller.law.system):
         assert {p.name: p.bounds for p in system.parameters if p.bounds} == {"wall.a": (0.5, 2.0)}
     with pytest.raises(ScenarioError, match=r"A\(x\).*'wall\.a'"):
-        dd.build_scenario(two_link(TILTED, "bounds={wall.a: [0, 2]}"))
+        dd.build_scenario(shipped("two_link_wall", TILTED, "bounds={wall.a: [0, 2]}"))
 
 
 def test_a_model_is_found_by_its_name():

@@ -3,12 +3,7 @@
 import numpy as np
 from runs import run_scenario
 
-from drake_dae import load_scenario
 from drake_dae.scenario.shipped import find_scenario
-
-
-def two_link(*settings):
-    return load_scenario(find_scenario("two_link_wall"), settings)
 
 
 def run(scenario):
