@@ -73,13 +73,9 @@ def test_messages_are_short_whatever_the_value_is():
 
 
 def test_paths_that_are_none(tmp_path, monkeypatch):
-    for path in ("a\0b", tmp_path, tmp_path / "none", "x" * 5000):
+    for path in ("a\0b", "x" * 5000):
         with pytest.raises(ScenarioError):
             load_scenario(path)
-    utf16 = tmp_path / "utf16.yaml"
-    utf16.write_text("robot: {}", encoding="utf-16")
-    with pytest.raises(ScenarioError, match="UTF-8"):
-        load_scenario(utf16)
     for setting in ('robot.file="a\\0b"', 'robot.packages={a: "a\\0b"}'):
         with pytest.raises(ScenarioError):
             build_scenario(scenario("two_link_wall", setting))

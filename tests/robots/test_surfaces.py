@@ -227,9 +227,6 @@ HEIGHTS = 0.002 * np.cos(np.linspace(-2.0, 2.0, 33))[:, None] * np.ones(9)
 
 # Each with a point on it, and the sum of its principal curvatures there, positive for a ball.
 PIECES = {
-    "plane": (Plane((1, 2, 3), (1, 0, 1)), (0, 0, 0), 0.0),
-    "inside": (Sphere((0, 0, 0), 0.2, inside=True), (0, 0, -0.2), -10.0),
-    "ellipsoid": (Ellipsoid((0, 0, 0), (0.2, 0.2, 0.2)), (0, 0, 0.2), 10.0),
     "torus": (Torus((0, 0, 0), (0, 0, 1), 0.3, 0.1), (0.4, 0, 0), 12.5),
     "heights": (MeasuredSurface((0.04, 0.1), HEIGHTS), (0, 0, 0.002), 0.002 * (4.0 / 0.1) ** 2),
 }

@@ -7,7 +7,7 @@ import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
-from scenario_texts import lever, run, two_link
+from scenario_texts import run, two_link
 from two_arms import GRASP
 
 import drake_dae as dd
@@ -86,13 +86,15 @@ def test_files_in_settings_of_a_shipped_scenario_are_in_the_working_directory(
 
 
 def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
-    path = lever(tmp_path / "robots")
-    (tmp_path / "scenarios").mkdir()
+    for folder in ("robots", "scenarios"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "robots" / "arm.urdf").write_text(dd.shipped_model("two_link_arm.urdf").read_text())
+    text, shipped = find_scenario("two_link_wall").read_text(), "package://drake_dae_models/"
     away = tmp_path / "scenarios" / "away.yaml"
-    away.write_text(path.read_text().replace("lever.urdf", "../robots/lever.urdf"))
+    away.write_text(text.replace(f"{shipped}two_link_arm.urdf", "../robots/arm.urdf"))
     monkeypatch.chdir("/")
-    scenario = dd.load_scenario(away)
-    assert scenario.robot.file == str((tmp_path / "robots" / "lever.urdf").resolve())
+    scenario = dd.load_scenario(away, ["duration=0.1"])
+    assert scenario.robot.file == str((tmp_path / "robots" / "arm.urdf").resolve())
     assert run(scenario)[1].time[-1] == 0.1
 
 
