@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
-from runs import first_quick, scenario, some
+from runs import close_records, first_quick, scenario, some
 
 from drake_dae import DaePlant, DaeSystem, build_scenario, simulate
 from drake_dae.running import merged_run
@@ -123,9 +123,7 @@ def test_a_run_that_goes_on_is_that_of_drakes_simulator(short_runs):
         simulate(loop.diagram, expected, 0.04, block_by_block(chosen.integrator))
     found, right = loop.record(context), loop.record(expected)
     assert_array_equal(found.time, right.time)
-    for name in right.signals:
-        size = np.abs(right[name]).max(initial=1e-6)
-        assert_allclose(found[name], right[name], rtol=0, atol=1e-9 * size, err_msg=name)
+    close_records(found, right, 1e-9, least=1e-6)
 
 
 def test_a_fixed_value_at_a_connected_port_counts(short_runs):

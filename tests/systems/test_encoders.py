@@ -61,15 +61,6 @@ def test_it_is_the_map_by_hand():
     assert_allclose(found[1], by_hand, atol=1e-12)
 
 
-def test_velocity_is_late_by_its_lag():
-    """At a constant acceleration of 2 it is 2 lag behind, when exp(-W t) has died."""
-    encoders = Encoders(velocity_bandwidth=W)
-    _, found, (_, v) = measure(encoders, [0.0, 0.5, 1.0], [0.5, 2.0], 0.2)
-    lag = T / 2.0 + T * A / (1.0 - A)
-    assert_allclose(v[-1] - found[1, -1], 2.0 * lag, rtol=1e-9)
-    assert_allclose(lag, 1.0 / W, rtol=1e-2)  # To (W T)^2 / 12.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("delta", [1e-5, 1e-4])
 def test_rounding_is_noise_of_its_deviation(delta):

@@ -6,7 +6,7 @@ from arms import arm, consistent_states, fixed_step, law, touching
 from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource, Sine
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource
 from runs import some
 
 import drake_dae as dd
@@ -176,13 +176,6 @@ def test_a_sensor_starts_as_if_it_had_felt_a_constant_force(lag, period):
             simulator.AdvanceTo(time)
         shown = sensor.GetOutputPort("measured_force").Eval(own)
         np.testing.assert_allclose(shown, [8.5, 2.8], rtol=1e-14)
-
-
-def test_sampling_holds():
-    times, values = sensed(dd.ForceSensor(1, sample_period=0.1), Sine(1.0, 3.0, 0.0, 1), 1.0)
-    # Between its samples, at the middle of each period, it shows the last one.
-    middle = np.isclose(times % 0.1, 0.05)
-    np.testing.assert_allclose(values[0, middle], np.sin(3.0 * (times[middle] - 0.05)), atol=1e-9)
 
 
 @pytest.mark.slow
