@@ -73,13 +73,9 @@ def test_messages_are_short_whatever_the_value_is():
 
 
 def test_paths_that_are_none(tmp_path, monkeypatch):
-    for path in ("a\0b", tmp_path, tmp_path / "none", "x" * 5000):
+    for path in ("a\0b", "x" * 5000):
         with pytest.raises(ScenarioError):
             load_scenario(path)
-    utf16 = tmp_path / "utf16.yaml"
-    utf16.write_text("robot: {}", encoding="utf-16")
-    with pytest.raises(ScenarioError, match="UTF-8"):
-        load_scenario(utf16)
     for setting in ('robot.file="a\\0b"', 'robot.packages={a: "a\\0b"}'):
         with pytest.raises(ScenarioError):
             build_scenario(scenario("two_link_wall", setting))
@@ -92,25 +88,16 @@ def test_paths_that_are_none(tmp_path, monkeypatch):
             load_scenario("scenario.yaml")
 
 
-def test_a_context_of_another_system_is_refused():
-    plants = [RobotPlant(arm("two_link").model, structure=arm("two_link").structure) for _ in "ab"]
-    context = plants[1].CreateDefaultContext()
-    for refused in (
-        lambda: plants[0].set_parameter(context, "link1.mass", 2.0),
-        lambda: plants[0].get_parameter(context, "link1.mass"),
-        lambda: plants[0].set_state(context, arm("two_link").structure.states[0]),
-    ):
-        with pytest.raises(ModelError, match="'two_link'"):
-            refused()
-
-
 def test_a_context_of_another_loop_is_refused_in_a_sentence(tmp_path):
     """Drake's own text of it has no remedy, and a link to an issue."""
-    (loop, _), (_, context) = (build_scenario(scenario("two_link_wall")) for _ in "ab")
+    (loop, _), (other, context) = (build_scenario(scenario("two_link_wall")) for _ in "ab")
+    own = other.plant.GetMyMutableContextFromRoot(context)
     for refused in (
         lambda: simulate(loop.diagram, context, 0.01),
         lambda: loop.record(context),
         lambda: loop.set_state(context, arm("two_link").structure.states[0]),
+        lambda: loop.plant.get_parameter(own, "link1.mass"),
+        lambda: loop.plant.set_parameter(own, "link1.mass", 2.0),
         lambda: start_values(loop, context),
         lambda: export_loop(loop, context, "a", tmp_path),
         lambda: make_animation(loop, loop.record(loop.diagram.CreateDefaultContext()), context),

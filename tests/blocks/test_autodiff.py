@@ -30,7 +30,8 @@ def plant_of(name):
         plant, state = dd.DaePlant(problem.system), problem.consistent(random)
     elif " " in name:
         robot, kind = name.split(maxsplit=1)
-        plant = robot_plant(robot, kind)
+        found = actuated(robot, kind)
+        plant = dd.RobotPlant(found.model, structure=found.structure)
         state = states(robot, kind, 1)[0]
     else:
         plant = dd.RobotPlant(arm(name).model, structure=arm(name).structure)
@@ -39,11 +40,6 @@ def plant_of(name):
 
 
 PLANTS = [*PROBLEMS, "two_link", "seven_joint", "two_link flexible motor", "two_link hydraulic"]
-
-
-def robot_plant(name, kind):
-    found = actuated(name, kind)
-    return dd.RobotPlant(found.model, structure=found.structure)
 
 
 def all_parameters(system):
@@ -121,24 +117,6 @@ def test_controllers(name):
     check_gradient(system, inputs)
 
 
-def test_a_controller_with_measured_force():
-    found = arm("two_link")
-    feedback = dd.TrackingLaw(
-        found.model.dae, poles(-3.0), structure=found.structure, measured_force=True, force_gain=2.0
-    )
-    inputs = {
-        "estimated_state": consistent_states("two_link", 1)[0],
-        "reference": np.array([0.2, 0.1, -0.3, 17.0]),
-        "measured_force": np.array([12.0]),
-    }
-    check_gradient(dd.TrackingController(feedback), inputs)
-
-
-def test_a_force_sensor():
-    sensor = dd.ForceSensor(2, 0.05, bias=[1.0, -2.0], noise_deviation=0.3, drift=[0.2, 0.1])
-    check_gradient(sensor, {"force": [3.0, 4.0], "noise": [0.1, 0.2]}, [1.0, 2.0])
-
-
 @pytest.mark.parametrize(
     "make",
     [
@@ -192,26 +170,6 @@ def test_references_move_with_the_time():
     )
 
 
-def test_linearize_a_hanging_pendulum():
-    """v = -(vx^2 + vy^2 + x u - g y) / (2 x^2 + 2 y^2): x'' = -g x + u, y'' = 0, z = x."""
-    plant = dd.DaePlant(hanging_pendulum())
-    context = plant.CreateDefaultContext()
-    plant.GetInputPort("control").FixValue(context, [0.0])
-    linear = Linearize(
-        plant,
-        context,
-        plant.GetInputPort("control").get_index(),
-        plant.GetOutputPort("controlled_output").get_index(),
-    )
-    g = 9.81
-    matrix = [[0, 0, 1, 0], [0, 0, 0, 1], [-g, 0, 0, 0], [0, 0, 0, 0]]
-    # A handful of products, each exact to round-off of numbers up to 10.
-    np.testing.assert_allclose(linear.A(), matrix, atol=1e-14)
-    np.testing.assert_allclose(linear.B()[:, 0], [0, 0, 1, 0], atol=1e-14)
-    np.testing.assert_allclose(linear.C(), [[1, 0, 0, 0]], atol=1e-14)
-    np.testing.assert_allclose(linear.D(), [[0]], atol=1e-14)
-
-
 def assert_poles(loop, context, poles, zeros, tolerance):
     """The eigenvalues of a loop at rest are given poles and a number of zeros.
 
@@ -259,19 +217,6 @@ def test_closed_loops_have_the_assigned_poles(name, kind):
     loop, context = resting_loop(model, structure, poles(assigned))
     # Round-off of A, whose largest entries belong to stiff joints and small inductances.
     assert_poles(loop, context, np.concatenate([*assigned.values()]), 2, 2e-9)
-
-
-def test_a_closed_loop_keeps_its_zero_dynamics():
-    """With the rod force held at v, m y'' = v y - m g: an oscillation with w^2 = -v / m."""
-    problem = PROBLEMS["pendulum_tension"]()
-    mass, length, gravity, angle = 2.0, 0.8, 9.81, 0.6
-    force = -mass * gravity / (length * np.cos(angle))
-    design = dd.TrackingLaw(problem.system, poles(-1.0))
-    loop = dd.make_closed_loop(dd.DaePlant(problem.system), design, [dd.ConstantReference(force)])
-    context = loop.diagram.CreateDefaultContext()
-    context.SetContinuousState([length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0])
-    swing = 1j * np.sqrt(-force / mass)
-    assert_poles(loop, context, [swing, -swing], 2, 1e-12)
 
 
 def test_failures_name_time_and_state():

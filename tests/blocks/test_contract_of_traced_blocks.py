@@ -7,13 +7,12 @@ import numpy as np
 import polishing
 import pytest
 from actuated import actuated
-from alone import alone
 from arms import arm, law
 from blocks_of_users import Counter_
 from pydrake.symbolic import Variable, if_then_else, logical_and
 from pydrake.systems import primitives as drake
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, PortDataType
 from runs import some
 
 import drake_dae as dd
@@ -22,7 +21,7 @@ from drake_dae.blocks.compose import compose
 from drake_dae.dae import with_disturbance
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout_program import RolloutProgram
-from drake_dae.systems import CommandedReferences, Observing, PointMaterial
+from drake_dae.systems import Observing, PointMaterial
 from drake_dae.systems.applied_control import ControlHold, ControlLimits, Sampling
 from drake_dae.systems.sensors import Encoders, StateSensor
 
@@ -45,12 +44,6 @@ def references():
     return dd.ReferenceGenerator([height, force], law("two_link").degrees)
 
 
-def commanded():
-    of = law("two_link")
-    own, signals = references().references, of.system.output_signals
-    return CommandedReferences(own, of.degrees, signals)
-
-
 def robot(kind):
     found = arm("two_link") if kind is None else actuated("two_link", kind)
     return dd.RobotPlant(found.model, structure=found.structure)
@@ -67,12 +60,6 @@ def found_friction():
     return dd.TrackingLaw(dae, dd.poles(-4.0), measured_force=True)
 
 
-def observer(**more):
-    """Of a contact that sticks, is lost, or neither."""
-    rates = Observing(20.0, force_rate=30.0, **more)
-    return dd.StateEstimator(found_friction(), rates, 0.01, 0.5, 0.02)
-
-
 def estimator(lag, **more):
     rates = Observing(10.0, force_rate=15.0, state_rate=30.0, **more)
     return dd.StateEstimator(
@@ -80,37 +67,20 @@ def estimator(lag, **more):
     )
 
 
-def observer_behind_springs():
-    system = actuated("two_link", "flexible").model.dae
-    dae = with_disturbance(system, [signal.name for signal in system.state_signals[2:4]])
-    return dd.StateEstimator(dd.TrackingLaw(dae, dd.poles(-4.0)), Observing(20.0), 0.01)
-
-
 BLOCKS = {
     "RobotPlant": lambda: robot(None),
     "RobotPlant with springs": lambda: robot("flexible"),
-    "RobotPlant with motors": lambda: robot("motor"),
     "RobotPlant with hydraulic servos": lambda: robot("hydraulic"),
     "CompliantPlant": lambda: dd.CompliantPlant(arm("two_link").model, PointMaterial(0.01)),
-    "CompliantPlant that is continuous": lambda: dd.CompliantPlant(
-        arm("two_link").model, PointMaterial(0.0, dissipation=1.0)
-    ),
     "CompliantPlant with springs": lambda: dd.CompliantPlant(
         actuated("two_link", "flexible").model, PointMaterial(0.01, friction=0.3)
     ),
     "ReferenceGenerator": references,
-    "CommandedReferences": commanded,
     "TrackingController": lambda: dd.TrackingController(law("two_link")),
-    "TrackingController of a measured force": lambda: dd.TrackingController(measured_law(())),
-    "TrackingController with the integral of a force": lambda: dd.TrackingController(
-        measured_law(("wall.force",), 0.0)
-    ),
     "TrackingController with a sampled integral": lambda: dd.TrackingController(
         measured_law(("tool.z", "wall.force"), 0.0), sample_period=0.01
     ),
     "ControlLimits": lambda: ControlLimits([0.5, 2.0]),
-    "ForceSensor with a lag": lambda: dd.ForceSensor(2, 0.01, bias=0.1),
-    "ForceSensor with samples": lambda: dd.ForceSensor(2, sample_period=0.01, bias=[0.1, 0.2]),
     "TaskController": lambda: dd.TaskController(
         dd.Task([dd.Approach(), dd.Press(20.0), dd.Release()]),
         *polishing.laws(),
@@ -118,22 +88,13 @@ BLOCKS = {
     ),
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
-    "StateEstimator of exact states": lambda: observer(least_force=1e-3),
-    "StateEstimator of exact states of a contact that sticks": lambda: observer(
-        least_speed=1e3, least_force=1e-3
-    ),
-    "StateEstimator of exact states behind springs": observer_behind_springs,
     "StateEstimator": lambda: estimator(0.5, least_force=1e-3),
-    "StateEstimator of a discrete plant": lambda: estimator(1.0, least_force=1e-3),
     "StateEstimator of a contact that sticks": lambda: estimator(
         0.5, least_speed=1e3, least_force=1e-3
     ),
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),
     "StateSensor with differences": lambda: StateSensor(
         4, 2, Encoders(resolution=1e-3, velocity_bandwidth=200.0, position_bias=0.1), 0.01
-    ),
-    "StateSensor with noise": lambda: StateSensor(
-        4, 2, Encoders(position_noise=0.1, velocity_noise=0.2), 0.01
     ),
     "ForceSensor with all of it": lambda: dd.ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2], 0.4),
 }
@@ -178,6 +139,33 @@ SYSTEMS = {
     "a diagram of primitives": lambda: drake.StateInterpolatorWithDiscreteDerivative(2, 0.1),
     "a template whose updates begin later": lambda: Counter_[None](0.1, 0.03),
 }
+
+
+def alone(system):
+    """A diagram of one system, all ports exported, and a context with random numbers in it.
+
+    An input port has the name "in <index>" there, an output port with vectors "out <index>".
+    """
+    builder, random = DiagramBuilder(), np.random.default_rng(0)
+    builder.AddSystem(system)
+    for i in range(system.num_input_ports()):
+        if system.get_input_port(i).get_data_type() == PortDataType.kVectorValued:
+            builder.ExportInput(system.get_input_port(i), f"in {i}")
+    for i in range(system.num_output_ports()):
+        if system.get_output_port(i).get_data_type() == PortDataType.kVectorValued:
+            builder.ExportOutput(system.get_output_port(i), f"out {i}")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    context.SetTime(0.4)
+    for i in range(diagram.num_input_ports()):
+        port = diagram.get_input_port(i)
+        port.FixValue(context, random.normal(size=port.size()))
+    state = context.get_mutable_continuous_state_vector()
+    state.SetFromVector(random.normal(size=state.size()))
+    discrete = context.get_mutable_discrete_state()
+    for i in range(discrete.num_groups()):
+        discrete.get_mutable_vector(i).SetFromVector(random.normal(size=discrete.value(i).size))
+    return diagram, context
 
 
 def in_context(name):

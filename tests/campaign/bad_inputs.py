@@ -1,22 +1,19 @@
-"""Scenarios, robots, records and command lines with mistakes, read by what users read them with."""
+"""Scenarios, robots and command lines with mistakes, read by what users read them with."""
 
 import contextlib
 import io
 import os
 import random
 import re
-import struct
-import zipfile
 from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import yaml
 from campaign.outcomes import RAW, REFUSED, Outcome, checked
 
-from drake_dae import Record, build_scenario, load_scenario, simulate
+from drake_dae import build_scenario, load_scenario, simulate
 from drake_dae.cli import main
 from drake_dae.scenario.form import dump_yaml, load_yaml
 from drake_dae.scenario.robot_file.reading import finalize, read_robot
@@ -232,14 +229,11 @@ def _written(data: Any, folder: Path) -> Path:
 
 # Files and commands.
 
-SIZES = ("(1000000, 1000000)", "(-3, 3)", "(3,)", "()", "(3, 3, 3)", "(2, 10)", "'a'", "(1e3, 3)")
-KINDS = ("<f8", "<f4", "<i2", "<c16", "|b1", "<U4", "|O", "<M8[s]", "nonsense", "<f16")
-
 
 def file_attempt(seed: int, folder: Path) -> Outcome:
-    """Reads a bad robot or record, or runs a bad command."""
+    """Reads a bad robot, or runs a bad command."""
     choice = random.Random(seed)
-    return choice.choices((_any_robot, _record, _command), (4, 2, 5))[0](choice, folder)
+    return choice.choices((_any_robot, _command), (4, 5))[0](choice, folder)
 
 
 def _any_robot(choice: random.Random, folder: Path) -> Outcome:
@@ -270,30 +264,6 @@ def _any_robot(choice: random.Random, folder: Path) -> Outcome:
 
     with checked(f"{file.name}: {how}") as outcome:
         finalize(read_robot(Robot(file=str(folder / name)))[0])
-    return outcome
-
-
-def _record(choice: random.Random, folder: Path) -> Outcome:
-    """A record that is damaged, or whose arrays claim what they do not hold."""
-    file = folder / "record.npz"
-    Record(np.arange(3.0), {}).save(file)
-    how = choice.choice(("damage", "damage", "member", "rows"))
-    if how == "rows":
-        head = choice.choice(("[" * 9999, '{"signals": 1}', '{"signals": {"a": [[1]]}}', "{}", "{"))
-        file.write_bytes(head.encode() + b"\n" + bytes(100))
-    elif how == "member":
-        size, kind = choice.choice(SIZES), choice.choice(KINDS)
-        order = choice.random() < 0.2
-        text = f"{{'descr': '{kind}', 'fortran_order': {order}, 'shape': {size}, }}".encode()
-        text = text.ljust(117) + b"\n"
-        data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(160)
-        with zipfile.ZipFile(file, "w") as archive:
-            archive.writestr("time.npy", data)
-    else:
-        data, how = _damaged(file.read_bytes(), choice)
-        file.write_bytes(data)
-    with checked(f"record: {how}") as outcome:
-        Record.load(file)
     return outcome
 
 

@@ -16,7 +16,6 @@ from problems.zero_systems import (
     Array,
     internal,
     quadruple_tank,
-    zero_dynamics,
 )
 from runs import some
 
@@ -36,7 +35,7 @@ def tanks_at_rest(pumps, valves, levels) -> tuple[Array, Array]:
 @pytest.mark.parametrize("plant", [MINIMUM_PHASE, NON_MINIMUM_PHASE])
 def test_zeros_of_the_four_tanks(plant):
     """(1 + s T3)(1 + s T4) = (1 - g1)(1 - g2)/(g1 g2), T_i = A_i/a_i sqrt(2 h_i/g)."""
-    dynamics = zero_dynamics(quadruple_tank(**plant))
+    dynamics = ZeroDynamics(quadruple_tank(**plant))
     levels, _ = tanks_at_rest(**plant)
     t3, t4 = (TANK_AREAS / HOLES * np.sqrt(2 * levels / TANK_GRAVITY))[2:]
     g1, g2 = plant["valves"]
@@ -71,14 +70,14 @@ def test_equilibrium_of_a_robot_against_multibody_plant():
 
 def test_no_equilibrium_is_reported():
     """s' = 1 + s^2 has none, nor has a blade pinned to a speed; with speed 0 it has many."""
-    dynamics = zero_dynamics(internal(lambda s, z: 1 + s**2))
+    dynamics = ZeroDynamics(internal(lambda s, z: 1 + s**2))
     assert not len(dynamics.equilibria(outputs=[0.0]))
     growing = dynamics.stability(outputs=[0.0])
     assert re.search(r"z = 0 .*s' = ", growing.reason)
     assert growing.verdict is Verdict.UNDECIDED
     assert (growing.state, growing.eigenvalues.shape) == (None, (0,))
 
-    blade = zero_dynamics(PROBLEMS["knife_edge"]().system)
+    blade = ZeroDynamics(PROBLEMS["knife_edge"]().system)
     assert not len(blade.equilibria(outputs=[0.3, 0.8]))
     assert "V = 0.8" in blade.stability(outputs=[0.3, 0.8]).reason
     assert blade.stability().verdict is Verdict.UNDECIDED

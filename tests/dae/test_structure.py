@@ -3,18 +3,16 @@
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from problems import PROBLEMS, changed, double_integrator, hidden_normal_form, system_of
+from problems import PROBLEMS, changed, double_integrator, system_of
 from problems.found import degrees, untidy_one, violation
-from runs import some
 
 from drake_dae.analysis import Finding, analyze
-from drake_dae.dae import DaeSystem, find_constraint_structure, find_structure
+from drake_dae.dae import DaeSystem, find_structure
 from drake_dae.errors import AssumptionError, ModelError
-from drake_dae.trace.functions import TracedFunction
 
 
 @pytest.mark.slow
+@pytest.mark.equation(15)
 def test_degrees_index_and_dimensions(problem):
     structure = problem.structure
     assert structure.constraint_degrees == problem.constraint_degrees
@@ -23,36 +21,6 @@ def test_degrees_index_and_dimensions(problem):
     assert structure.manifold.dimension == problem.manifold_dimension
     assert structure.zero_dynamics_dimension == problem.zero_dynamics
     assert structure.output_order == problem.output_order
-
-
-@pytest.mark.slow
-@pytest.mark.equation(15)
-def test_the_order_of_the_outputs_is_that_of_15(problem):
-    """In the order found, n* has s rows of zeros first, and every row after has an entry."""
-    structure = problem.structure
-    n_star = TracedFunction(
-        "n*",
-        {"x": problem.system.state, "p": problem.system.parameter_symbol},
-        {"n": structure.elimination.n_star},
-    )
-    for state in structure.states:
-        value = n_star(state, problem.system.parameter_values)[0]
-        value = value.reshape(problem.system.num_controls, -1)[list(structure.output_order)]
-        s = sum(degree > 0 for degree in problem.output_degrees)
-        # Entries of order 1, or zero up to round-off.
-        assert np.abs(value[:s]).max(initial=0.0) < 1e-14
-        assert np.abs(value[s:]).max(axis=1, initial=0.0).min(initial=1.0) > 1e-3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(6), of=6))
-def test_hidden_normal_forms_are_found(seed):
-    """Systems of random degrees behind a diffeomorphism, a feedback, mixed inputs and orders."""
-    hidden = hidden_normal_form(seed)
-    structure = find_structure(hidden.system)
-    assert structure.constraint_degrees == hidden.constraint_degrees
-    assert structure.output_degrees == hidden.output_degrees
-    assert structure.zero_dynamics_dimension == hidden.zero_dynamics
 
 
 def test_a_force_that_the_control_does_not_act_on_is_not_met_at_once():
@@ -70,42 +38,6 @@ def test_a_force_that_the_control_does_not_act_on_is_not_met_at_once():
     error = violation(resting)
     assert error.assumption == 4
     assert "'tension'" in str(error)
-
-
-def test_constraints_alone_decide_how_a_system_moves():
-    """The same degrees, A(x) and rate as with outputs; B(x) may be singular, or not square."""
-    x = ca.SX.sym("x", 4)
-    pendulum = {
-        "state": x,
-        "f": ca.vertcat(x[2], x[3], 0, -9.81),
-        "g": ca.vertcat(0, 0, x[0], x[1]),
-        "k": (ca.sumsqr(x[:2]) - 1) / 2,
-        "nominal_state": [1.0, 0.0, 0.0, 0.0],
-    }
-    h = ca.vertcat(0, 0, -x[1], x[0])
-    whole = find_structure(DaeSystem(**pendulum, h=h, l=x[0] * x[3] - x[1] * x[2], m=[0]))
-    others = {
-        "nothing": {"h": ca.SX(4, 0), "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
-        "the constraint as an output": {"h": h, "l": ca.sumsqr(x[:2]), "m": [0]},
-        "two outputs": {"h": h, "l": x[:2], "m": [[0], [1]]},
-    }
-    state = whole.manifold.project([0.6, 0.8, 0.4, -0.3])
-    for name, fields in others.items():
-        found = find_constraint_structure(DaeSystem(**pendulum, **fields))
-        assert (found.constraint_degrees, found.index) == ((2,), 3), name
-        elimination = found.elimination
-        values = found.system.trace("values", {"f": elimination.f_star, "v": elimination.alpha})
-        expected = whole.system.trace(
-            "values", {"f": whole.elimination.f_star, "v": whole.elimination.alpha}
-        )
-        for one, other in zip(values(state, []), expected(state, []), strict=True):
-            assert_allclose(one, other, atol=1e-14)  # The same operations.
-    analysis = analyze(DaeSystem(**pendulum, **others["nothing"]))
-    assert [str(a.finding) for a in analysis.assumptions] == ["satisfied"] * 3 + [
-        "not examined"
-    ] * 2
-    assert analysis.constraint_structure.constraint_degrees == (2,)
-    assert not analysis.problems
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from problems import PROBLEMS
-from problems.zero_systems import (
-    GRAVITY,
-    Array,
-    assert_same_numbers,
-    cart_pendulum,
-    spring_masses,
-    zero_dynamics,
-)
+from problems.zero_systems import GRAVITY, Array, assert_same_numbers, cart_pendulum, spring_masses
 from runs import some
 
 from drake_dae.dae import DaeSystem, Verdict, ZeroDynamics
@@ -56,7 +49,7 @@ def linear_system(seed: int, n: int = 7, m: int = 1, p: int = 2) -> DaeSystem:
 @pytest.mark.parametrize("seed", some(range(8), of=3))
 def test_eigenvalues_of_linear_systems_are_their_invariant_zeros(seed):
     system = linear_system(seed, n=7 + seed % 3, m=seed % 3)
-    dynamics = zero_dynamics(system)
+    dynamics = ZeroDynamics(system)
     zeros = finite_zeros(system)
     assert zeros.shape == (dynamics.dimension,) == (system.num_states - 2 - seed % 3,)
     stability = dynamics.stability()
@@ -71,7 +64,7 @@ def test_eigenvalues_of_linear_systems_are_their_invariant_zeros(seed):
 def test_pendulum_on_a_cart_is_not_minimum_phase():
     """Upright +- sqrt(g/L); hanging +- i sqrt(g/L), or damped."""
     rate = np.sqrt(GRAVITY / 0.7)
-    upright = zero_dynamics(cart_pendulum()).stability()
+    upright = ZeroDynamics(cart_pendulum()).stability()
     # Rod and cart in Cartesian coordinates, ten operations.
     np.testing.assert_allclose(upright.eigenvalues, [rate, -rate], rtol=1e-10)
     assert upright.verdict is Verdict.UNSTABLE
@@ -79,13 +72,13 @@ def test_pendulum_on_a_cart_is_not_minimum_phase():
     assert "3.744 1/s" in upright.reason
     assert "s = 0.3" in upright.reason
 
-    hanging = zero_dynamics(cart_pendulum(angle=np.pi)).stability()
+    hanging = ZeroDynamics(cart_pendulum(angle=np.pi)).stability()
     assert_same_numbers(hanging.eigenvalues, np.array([1j, -1j]) * rate, rtol=1e-10, atol=1e-10)
     assert hanging.verdict is Verdict.UNDECIDED
     assert "2 of 2" in hanging.reason
 
     # L a'' = -g a - d L a', found from a start beside it.
-    swung = zero_dynamics(cart_pendulum(damping=0.8, angle=2.8)).stability()
+    swung = ZeroDynamics(cart_pendulum(damping=0.8, angle=2.8)).stability()
     assert_same_numbers(swung.eigenvalues, np.roots([1.0, 0.8, rate**2]), rtol=1e-10)
     assert swung.verdict is Verdict.STABLE
     np.testing.assert_allclose(swung.state[:3], [0.3, 0.3, -0.7], rtol=0, atol=1e-10)
@@ -94,7 +87,7 @@ def test_pendulum_on_a_cart_is_not_minimum_phase():
 @pytest.mark.parametrize("damping", [0.0, 1e-6, 0.1, -1e-6])
 def test_a_center_is_undecided_and_the_least_damping_is_not(damping):
     """2 q2'' + d q2' + 8 q2 = 8 q1."""
-    dynamics = zero_dynamics(spring_masses(damping))
+    dynamics = ZeroDynamics(spring_masses(damping))
     stability = dynamics.stability([0.3, 0.2, 0.1, 0.1])
     np.testing.assert_allclose(stability.state, [0.3, 0.3, 0, 0], atol=1e-12)
     assert_same_numbers(

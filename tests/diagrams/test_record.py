@@ -200,11 +200,3 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ModelError, match=r"pandas.*\[data\]"):
         small().to_dataframe()
-
-
-def test_what_a_notebook_shows():
-    record = small()
-    assert repr(record) == (
-        "Record(3 times from 0 to 0.3 s, signals=[state (2), constraint_force (0)])"
-    )
-    assert repr(Record(np.zeros(0), {})) == "Record(0 times, signals=[])"

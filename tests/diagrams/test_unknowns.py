@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from pydrake.math import RollPitchYaw
 from pydrake.multibody.tree import JacobianWrtVariable
-from runs import run_scenario, scenario, scenario_model
+from runs import run_scenario, scenario
 
 from drake_dae import build_scenario
 
@@ -63,19 +63,6 @@ def test_a_disturbance_leaves_the_error_of_statics(plant):
     expected = left_behind([0.0, 5.0])
     assert 1e-3 < expected < 2e-2
     assert_allclose(record["tracking_error"][-1, 0], expected, rtol=2e-2)
-
-
-def test_payload_that_is_known_is_no_error():
-    """The law of `robot.payloads` has them: what is left is the accuracy of the integrator."""
-    found = two_link("robot.payloads=[{frame: tool, mass: 0.5}]")
-    _, _, record = run_scenario(found)
-    assert np.abs(record["tracking_error"][:, 0]).max() < 1e-8
-    mass, normal, along = statics()
-    expected = mass + 0.5 * np.vstack([normal, along]).T @ np.vstack([normal, along])
-    dae = scenario_model(found).dae
-    matrix = dae.trace("mass", {"mass": dae.mass_matrix})
-    inertia = np.array(matrix(record["state"][0], dae.parameter_values)[0])
-    assert_allclose(inertia.reshape(4, 4)[2:, 2:], expected, rtol=1e-7)
 
 
 def test_contact_has_the_masses_of_its_own():

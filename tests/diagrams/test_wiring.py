@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 from arms import arm, touching
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.primitives import VectorLogSink
 from runs import scenario
 
 import drake_dae as dd
@@ -53,23 +51,6 @@ def test_behind_motors_the_force_may_be_connected_directly():
     loop = dd.make_closed_loop(dd.RobotPlant(model, structure=law.structure), law, REFERENCES)
     assert loop.sensor is None
     assert not loop.diagram.HasAnyDirectFeedthrough()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["two_link_measured_force", "wall_point_contact"])
-def test_all_signals_are_in_one_log_of_which_the_record_is_cut(name):
-    """The first sample has the values of the ports before the first step."""
-    loop, context = dd.build_scenario(scenario(name, "compiled=false"))
-    logs = [each for each in loop.diagram.GetSystems() if isinstance(each, VectorLogSink)]
-    assert logs == [loop.log]
-    Simulator(loop.diagram, context).Initialize()
-    record = loop.record(context)
-    assert record.time.tolist() == [0.0]
-    assert {"state", "measured_force"} <= {*loop.signals}
-    for signal, names in loop.signals.items():
-        port = loop.diagram.GetOutputPort(signal)
-        np.testing.assert_array_equal(record[signal], [port.Eval(context)], err_msg=signal)
-        assert record.signals[signal].signals == names
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,6 @@ def test_the_start_is_the_published_one():
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_the_end_is_the_published_one_as_far_as_that_is_right():
     """At 0.03 s, after two and a half turns of the crank.
 

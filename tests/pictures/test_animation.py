@@ -11,14 +11,12 @@ from browser import needs_chromium
 from browser import shown as in_browser
 from members import Mirror
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.math import RotationMatrix
+from pydrake.math import RollPitchYaw, RotationMatrix
 from recordings import animation, commands, middles, objects, overlay, transforms, vertices
 from runs import run, run_scenario, scenario, some
 
 from drake_dae import (
     ConstantReference,
-    DaePlant,
-    DaeSystem,
     JointPositions,
     Record,
     RobotModel,
@@ -30,12 +28,10 @@ from drake_dae import (
     poles,
     robots,
     simulate,
-    start_meshcat,
 )
 from drake_dae.diagrams.record import Recorded
-from drake_dae.errors import ModelError
-from drake_dae.pictures.motion import contact_paths, follow, frame_times
-from drake_dae.robots import ConstraintWrenches, tangents
+from drake_dae.pictures.motion import frame_times
+from drake_dae.robots import ConstraintWrenches
 from drake_dae.scene.surroundings import diagonal, scene_points
 
 NAMES = ["two_link_wall", "seven_joint_dome"]
@@ -191,27 +187,6 @@ def test_a_title_is_text(shown):
     assert title not in page
 
 
-def test_paths_on_a_surface(shown):
-    """On a plane in its own coordinates; on a sphere in the tangent plane below the mean normal."""
-    loop, record, _ = shown
-    course = follow(loop, record, loop.diagram.CreateDefaultContext())
-    (path,) = contact_paths(course)
-    contact = loop.plant.model.constraints[0]
-    assert path.name == contact.name
-    assert path.actual.shape == path.desired.shape == (33, 2)
-    points = course.points[:, 0] - contact.surface.position
-    if isinstance(contact.surface, robots.Plane):
-        first, second = tangents(np.array(contact.surface.normal))
-    else:
-        normal = np.mean(points, axis=0)
-        first, second = tangents(normal / np.linalg.norm(normal))
-    wanted = np.column_stack([points @ first, points @ second])
-    np.testing.assert_allclose(path.actual, wanted, atol=1e-4)
-    # What is left of the error after a second.
-    far, near = (np.linalg.norm(path.actual[k] - path.desired[k]) for k in (0, 32))
-    assert near < far
-
-
 def test_the_desired_path_ends_where_it_leaves_the_reach():
     """The arm is 2 m long and the wall 1.2 m away: it reaches 1.6 m up. It is asked for more."""
     loop, record, _ = recorded("two_link_wall", "duration=1")
@@ -256,6 +231,21 @@ def test_a_parameter_moves_the_surface():
     np.testing.assert_allclose(arrow.values[:, 0], 1.1, atol=1e-3)
 
 
+@pytest.mark.slow
+def test_a_plate_that_moves_is_animated_where_it_is():
+    found = animation(recorded("seven_joint_moving_plate", "duration=0.5")[2])
+    position = found["/contact/plate/surface", "position"]
+    times = position.times
+    height = 0.4 + 0.05 * np.sin(2 * times)
+    np.testing.assert_allclose(position.values[:, 2], height, atol=1e-4)
+    turns = found["/contact/plate/surface", "quaternion"].values
+    for t, quaternion in zip(times, turns, strict=True):
+        wanted = RollPitchYaw(0.12 * np.sin(1.7 * t), 0.1 * np.sin(1.3 * t + 0.5), 0.0)
+        np.testing.assert_allclose(
+            rotation(quaternion), wanted.ToRotationMatrix().matrix(), atol=1e-4
+        )
+
+
 def test_one_moment_is_an_animation_too(shown):
     """What is left of a run that failed in its first step."""
     loop, record, _ = shown
@@ -288,18 +278,6 @@ def test_a_robot_that_is_held_at_no_point_is_animated_too(constraints):
     simulate(loop.diagram, context, 0.1, fixed_step())
     page = make_animation(loop, loop.record(context), context)
     assert not [path for path in objects(page) if path.startswith(("/contact", "/paths"))]
-
-
-def test_an_animation_needs_a_robot():
-    system = DaeSystem.from_functions(1, f=lambda x: [0.0], h=lambda x: [1.0], l=lambda x: [x[0]])
-    plain = TrackingLaw(system, poles(-1.0))
-    loop = make_closed_loop(
-        DaePlant(system), plain, [ConstantReference([1.0])], meshcat=start_meshcat()
-    )
-    context = loop.diagram.CreateDefaultContext()
-    simulate(loop.diagram, context, 0.01, fixed_step())
-    with pytest.raises(ModelError, match="RobotPlant"):
-        make_animation(loop, loop.record(context), context)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from runs import run_scenario, scenario, some
 from drake_dae import Record, plot_runs
 from drake_dae.cli import main
 from drake_dae.dae import Signal
-from drake_dae.diagrams.record import Recorded, phase_spans, phases_at
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.pictures import PLOTS
 from drake_dae.pictures.motion import ContactPath, contact_paths, follow
@@ -250,20 +250,6 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Figure, "savefig", fill)
     assert main(["plot", "--all", "--force", folders[0]]) == 1
     assert capsys.readouterr().err.startswith(f"error: {folders[0]}/outputs.png: ")
-
-
-def test_the_moment_of_a_change_shows_the_phase_before_it():
-    """As a sample there does: the phase that begins is known from the next one on."""
-    names = ("0 Approach", "1 Press", "2 Release")
-    run = Record(
-        np.arange(6.0),
-        {"phase": Recorded(np.eye(3)[[0, 0, 0, 1, 1, 2]], tuple(Signal(n, "") for n in names))},
-    )
-    spans = [(span.name, span.begin, span.end) for span in phase_spans(run)]
-    assert spans == [("Approach", 0.0, 2.0), ("Press", 2.0, 4.0), ("Release", 4.0, 5.0)]
-    times = np.array([0.0, 1.9, 2.0, 2.1, 4.0, 4.1, 5.0])
-    wanted = ["Approach"] * 3 + ["Press"] * 2 + ["Release"] * 2
-    assert phases_at(run, times) == wanted
 
 
 def test_names_of_short_phases_stand_apart():

@@ -1,7 +1,6 @@
 """A wheel built from the sdist is complete, and runs without the checkout."""
 
 import os
-import re
 import runpy
 import subprocess
 import sys
@@ -9,7 +8,6 @@ import sysconfig
 import tarfile
 import venv
 import zipfile
-from email import message_from_string
 from pathlib import Path
 
 import pytest
@@ -78,33 +76,6 @@ def test_wheel_from_sdist_holds_every_file_of_the_package(wheel: Path) -> None:
     assert {Path(name).suffix for name in diagrams} >= {".py", ".urdf", ".xml", ".yaml"}
     packed = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert packed == expected
-
-
-def links(text: str) -> list[str]:
-    """What the links and pictures of a text in Markdown lead to."""
-    return re.findall(r"\]\(([^)]*)\)", text)
-
-
-@pytest.mark.slow
-def test_readme_of_the_metadata_has_no_dead_link(dist: Path, wheel: Path) -> None:
-    """An index shows it without the files that README.md leads to; they are in the sdist."""
-    (sdist,) = dist.glob("*.tar.gz")
-    with tarfile.open(sdist) as archive, zipfile.ZipFile(wheel) as package:
-        (in_wheel,) = (name for name in package.namelist() if name.endswith("METADATA"))
-        (in_sdist,) = (name for name in archive.getnames() if name.endswith("PKG-INFO"))
-        info = archive.extractfile(in_sdist)
-        assert info is not None
-        texts = [package.read(in_wheel).decode(), info.read().decode()]
-        files = {name.split("/", 1)[1] for name in archive.getnames()}
-    for text in texts:
-        message = message_from_string(text)
-        assert message["Description-Content-Type"] == "text/markdown"
-        body = message.get_payload()
-        assert all(link.startswith("https://") for link in links(body))
-    for file in links((ROOT / "README.md").read_text("utf-8")):
-        if not file.startswith("https://"):
-            assert f"`{file}`" in body
-            assert any(name.startswith(file) for name in files), file
 
 
 def test_links_lead_to_an_address_where_one_is_given() -> None:

@@ -1,6 +1,6 @@
 """The laws behind actuation stages: the paper's own formulas, and errors known in advance."""
 
-from math import comb
+from math import comb, factorial
 
 import numpy as np
 import pytest
@@ -16,7 +16,6 @@ from actuated import (
     states,
 )
 from arms import fixed_step, numbers
-from assigned_errors import closed_form, coupled, new_input
 
 from drake_dae import RobotPlant, SinusoidReference, TrackingLaw, make_closed_loop, poles, simulate
 from drake_dae.dae import gain_matrices
@@ -25,6 +24,31 @@ from drake_dae.dae import gain_matrices
 def binomial(pole, degree, size):
     """Lambda_1, ..., Lambda_mu of (s - pole)^mu."""
     return [comb(degree, k) * (-pole) ** (degree - k) * np.eye(size) for k in range(degree)]
+
+
+def coupled(degree, size, random):
+    """Lambda_1, ..., Lambda_mu with poles from -3 to -5 that belong to mixtures of the errors."""
+    mix = np.eye(size) + 0.2 * random.standard_normal((size, size))
+    rows = np.array([np.poly(p)[:0:-1] for p in -random.uniform(3.0, 5.0, (size, degree))])
+    return [mix @ np.diag(column) @ np.linalg.inv(mix) for column in rows.T]
+
+
+def new_input(reference, gains, outputs):
+    """v(t) of (70), (71), (80), (81) from z, z', ...: r^(mu) - sum Lambda_k+1 (z^(k) - r^(k))."""
+    r = reference.reshape(-1, len(gains) + 1).T
+    return r[-1] - sum(g @ (z - r[k]) for k, (g, z) in enumerate(zip(gains, outputs, strict=True)))
+
+
+def closed_form(pole, start, times):
+    """e(t) of (s - pole)^mu e = 0 from e(0), e'(0), ...: exp(pole t) times a polynomial.
+
+    The polynomial is w = e exp(-pole t), whose derivatives at 0 follow from Leibniz's rule.
+    """
+    w = [
+        sum(comb(k, j) * (-pole) ** (k - j) * start[j] for j in range(k + 1))
+        for k in range(len(start))
+    ]
+    return np.exp(pole * times) * sum(c * times**k / factorial(k) for k, c in enumerate(w))
 
 
 class Links:

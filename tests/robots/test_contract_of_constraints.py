@@ -9,7 +9,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from members import FrictionalPoint, Mirror, Saddle, subclasses
+from members import Mirror, Saddle, subclasses
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
@@ -35,7 +35,6 @@ from drake_dae import (
     RevoluteLoopJoint,
     RollingWheel,
 )
-from drake_dae.errors import ModelError
 from drake_dae.robots import (
     Constraint,
     ConstraintSet,
@@ -70,11 +69,6 @@ Q = np.zeros(8)
 
 def plane_at(place, _):
     return PointOnSurface("tip", Plane(tuple(place @ POINT), (1.0, 2.0, -2.0)), POINT, "plane")
-
-
-def frictional_at(place, _):
-    surface = Plane(tuple(place @ POINT), (1.0, 2.0, -2.0))
-    return FrictionalPoint("tip", surface, POINT, "frictional", coefficient=0.4)
 
 
 def rough_at(place, _):
@@ -173,7 +167,6 @@ MEMBERS = {
     "planar revolute": (turning_in_a_plane_at, {"tip", "base"}),
     "prismatic": (sliding_at, {"tip", "base"}),
     "rod": (rod_at, {"tip", "base"}),
-    "frictional": (frictional_at, {"tip", "world"}),
     "rough": (rough_at, {"tip", "world"}),
     "wheel": (wheel_at, {"tip", "world"}),
     "tilted": (tilted_at, {"tip", "world"}),
@@ -404,8 +397,7 @@ def test_a_push_drives_the_residual_up():
         )(links.plant.GetPositions(context), v, values)
         up = rows.reshape(-1) @ np.linalg.solve(links.plant.CalcMassMatrix(context), columns)
         assert up > 0.0
-    rough = {"frictional", "rough"}
-    assert found == {"plane", "saddle", *rough}
+    assert found == {"plane", "saddle", "rough"}
 
 
 def pole():
@@ -438,8 +430,3 @@ def test_it_measures_the_tilt_and_has_no_second_zero(angle):
     constraint = AxisNormalToSurface("body", Plane((0, 0, 0), (0, 0, 1)))
     phi, _ = rows(constraint, links, [0.3, 0.1, angle])
     np.testing.assert_allclose(phi, [0.0, -2.0 * np.tan(angle / 2.0)], atol=1e-13)
-
-
-def test_an_axis_of_no_length_is_refused():
-    with pytest.raises(ModelError, match="axis"):
-        AxisNormalToSurface("tool", Plane((0, 0, 0), (0, 0, 1)), (0.0, 0.0, 0.0))

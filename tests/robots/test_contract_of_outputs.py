@@ -201,20 +201,6 @@ def test_a_squeeze_is_half_the_force_toward_the_other_contact(name):
     np.testing.assert_allclose(rows(output, q), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("output", "message"),
-    [
-        (ForceCombination({"grip2.f": 1.0}, "a"), "'grip2.f'"),
-        (Squeeze("object", "grip1", "grip4"), "'grip4'"),
-        (Squeeze("finger1::tip", "grip1", "grip2"), "'grip2'.*'finger1::tip'"),
-        (Pull("object", "grip", (1, 0, 0)), "'grip'"),
-    ],
-)
-def test_what_a_force_output_does_not_know_is_named(output, message):
-    with pytest.raises(ModelError, match=message):
-        force_rows([output], bound(), robot().links)
-
-
 @dataclass(frozen=True)
 class Pressed(ForceOutput):
     """No member: it is not linear."""
@@ -237,7 +223,16 @@ class Pressed(ForceOutput):
             lambda: ForceCombination({"grip1.fx": 1.0, "gear.moment": 1.0}, "a").signals(bound()),
             "'a'",
         ),
-        (lambda: force_rows([Pressed()], bound(), robot().links), "pressed"),
+        *(
+            (lambda output=output: force_rows([output], bound(), robot().links), message)
+            for output, message in (
+                (Pressed(), "pressed"),
+                (ForceCombination({"grip2.f": 1.0}, "a"), "'grip2.f'"),
+                (Squeeze("object", "grip1", "grip4"), "'grip4'"),
+                (Squeeze("finger1::tip", "grip1", "grip2"), "'grip2'.*'finger1::tip'"),
+                (Pull("object", "grip", (1, 0, 0)), "'grip'"),
+            )
+        ),
     ],
 )
 def test_force_outputs_that_make_no_sense_are_refused(make, message):

@@ -4,8 +4,6 @@ Drake and the library compute the same numbers of order 1 to 100 by different re
 tolerance of 1e-10 is round-off with room.
 """
 
-from functools import cache
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -16,11 +14,13 @@ from pydrake.multibody.tree import JacobianWrtVariable, RevoluteJoint, SpatialIn
 from two_arms import two_arms
 
 from drake_dae import (
+    AxisNormalToSurface,
     CoincidentPoints,
     FixedDistance,
     JointCoupler,
     JointPositions,
     LinkExpressions,
+    Plane,
     RobotModel,
     RobotPlant,
     WeldedFrames,
@@ -31,12 +31,6 @@ from drake_dae.trace.functions import TracedFunction
 
 VELOCITY = JacobianWrtVariable.kV
 PAIRS = [("right::link5", "left::link3"), ("right::tool", "world")]
-
-
-@cache
-def arms():
-    model = two_arms()
-    return model, find_structure(model.dae)
 
 
 def evaluate(constraint, links, q):
@@ -54,29 +48,6 @@ def evaluate(constraint, links, q):
     return residual, jacobian.reshape(len(residual), -1)
 
 
-def configurations(count, seed=0):
-    """Random ones of the two arms, with Drake's context there."""
-    plant = arms()[0].links.plant
-    random = np.random.default_rng(seed)
-    for _ in range(count):
-        q = random.uniform(-2.0, 2.0, plant.num_positions())
-        context = plant.CreateDefaultContext()
-        plant.SetPositions(context, q)
-        yield q, context, random
-
-
-def frames(*names):
-    """Of the two arms, by scoped name."""
-    plant = arms()[0].links.plant
-    for name in names:
-        *instance, own = name.split("::")
-        yield plant.GetFrameByName(own, *map(plant.GetModelInstanceByName, instance))
-
-
-def random_pose(random):
-    return RigidTransform(RollPitchYaw(random.uniform(-1, 1, 3)), random.uniform(-1, 1, 3))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("first", "second"), PAIRS)
 def test_weld_measures_a_pose_and_its_rate_the_relative_velocity(first, second):
@@ -84,10 +55,17 @@ def test_weld_measures_a_pose_and_its_rate_the_relative_velocity(first, second):
 
     r' = w + w x r / 2 + (w . r) r / 4.
     """
-    links = arms()[0].links
-    a, b = frames(first, second)
-    for q, context, random in configurations(5):
-        pose = random_pose(random)
+    links = two_arms().links
+    a, b = (
+        links.plant.GetFrameByName(own, *map(links.plant.GetModelInstanceByName, instance))
+        for *instance, own in (first.split("::"), second.split("::"))
+    )
+    random, context = np.random.default_rng(0), links.plant.CreateDefaultContext()
+    for _ in range(5):
+        q = random.uniform(-2.0, 2.0, links.plant.num_positions())
+        links.plant.SetPositions(context, q)
+        turned, shift = RollPitchYaw(random.uniform(-1, 1, 3)), random.uniform(-1, 1, 3)
+        pose = RigidTransform(turned, shift)
         phi, jacobian = evaluate(WeldedFrames(first, second, pose), links, q)
         found = links.plant.CalcRelativeTransform(context, a, b)
         turn = (found.rotation() @ pose.rotation().inverse()).ToAngleAxis()
@@ -168,16 +146,14 @@ def test_what_a_plant_has_besides_is_refused(add, message):
         RobotModel.from_multibody(two_wheels(add), [], [])
 
 
-def geared(ratio=-3.0):
-    """Two flywheels of 2 and 0.5 kg m^2, as equations."""
+def test_gears_carry_the_moment_of_the_textbook():
+    """(I_0 + r^2 I_1) q_0'' = u_0 + r u_1, and the moment on the follower is I_1 q_1'' - u_1.
+
+    Two flywheels of 2 and 0.5 kg m^2.
+    """
     q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
     links = LinkExpressions(q, v, ca.diag(ca.SX([2.0, 0.5])), ca.SX(2, 1))
-    return links, JointCoupler("q1", "q0", ratio, 0.1)
-
-
-def test_gears_carry_the_moment_of_the_textbook():
-    """(I_0 + r^2 I_1) q_0'' = u_0 + r u_1, and the moment on the follower is I_1 q_1'' - u_1."""
-    links, gears = geared()
+    gears = JointCoupler("q1", "q0", -3.0, 0.1)
     model = RobotModel(links, [gears], [JointPositions(["q0"])], [0.0, 0.1])
     assert find_structure(model.dae).constraint_degrees == (2,)
     block = RobotPlant(model)
@@ -200,6 +176,7 @@ def test_gears_carry_the_moment_of_the_textbook():
         (lambda: CoincidentPoints("a", (0, 0, 0), "b", (0, 0, 0), "xx"), "'xx'"),
         (lambda: WeldedFrames("a", "b", RigidTransform([np.inf, 0, 0])), r"weld\.position"),
         (lambda: JointCoupler("a", "b", unit="deg"), "'deg'"),
+        (lambda: AxisNormalToSurface("a", Plane((0, 0, 0), (0, 0, 1)), (0.0, 0.0, 0.0)), "axis"),
         (lambda: FixedDistance("a", (0, 0, 0), "b", (0, 0, 0), 0.0), r"'rod\.length'"),
     ],
 )

@@ -291,10 +291,16 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
         ),
         (lambda f: MeasuredSurface(file=f / "none.stl"), "none.stl"),
         (lambda f: MeasuredSurface(file=f / "wide.obj"), "wide.obj"),
+        (lambda f: MeasuredSurface(file=f / "ninth.obj"), "ninth.obj"),
+        (lambda f: MeasuredSurface((0.4, 0.3), file=f / "uneven.csv"), "uneven.csv"),
+        (lambda f: MeasuredSurface((0.4, 0.3), file=f / "commas.csv"), "commas.csv"),
     ],
 )
 def test_refusals(make, words, tmp_path):
     (tmp_path / "hole.csv").write_text("1, 2\nnan, 4\n")
+    (tmp_path / "uneven.csv").write_text("1,2\n3\n")
+    (tmp_path / "commas.csv").write_text("0,5 0,7\n0,1 0,2\n")
+    (tmp_path / "ninth.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
     (tmp_path / "wide.obj").write_text("v 0 0 0\nv 1e200 0 0\nv 0 1 0\nf 1 2 3\n")
     for kind in ("csv", "png", "npy", "npz", "zip", "obj", "stl"):
         (tmp_path / f"words.{kind}").write_text("these are words\n")

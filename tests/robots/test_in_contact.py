@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from arms import parse
-from members import FrictionalPoint
 from numpy.testing import assert_allclose
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import Parser
@@ -31,15 +30,11 @@ from drake_dae.robots import (
 from drake_dae.scenario.judging import find_feasibility
 
 
-def wall():
-    return PointOnSurface("tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")
-
-
 def rubbing_arm():
-    contact = FrictionalPoint("tool", wall().surface, name="wall", coefficient=0.3, speed=0.05)
-    plant = parse("two_link_arm")
+    wall = Plane((1.2, 0, 0), (-1, 0, 0))
+    contact = PointOnSurface("tool", wall, name="wall", friction=0.3, stiction_tolerance=0.05)
     outputs = [PointCoordinates("tool", "z")]
-    return RobotModel.from_multibody(plant, [contact], outputs, [1.2, -1.6])
+    return RobotModel.from_multibody(parse("two_link_arm"), [contact], outputs, [1.2, -1.6])
 
 
 def sphere_arm():

@@ -14,7 +14,6 @@ from vendors import joint, link, robot
 from drake_dae import (
     AxisCoordinates,
     CoincidentPoints,
-    Cylinder,
     ExpressionOutput,
     JointPositions,
     LinkExpressions,
@@ -211,32 +210,3 @@ def test_frames_that_are_half_a_turn_off_are_turned_to_each_other(cls: type, off
         a, b = (frame.CalcPoseInWorld(context).rotation().matrix() for frame in frames)
         free = 2 if cls is RevoluteLoopJoint else slice(None)
         np.testing.assert_allclose(a[:, free], b[:, free], atol=1e-12)
-
-
-SURFACES = Plane((0, 0, 0.3), (0, 0, 1)), Cylinder((0, 0, 0), (0, 0, 1), 0.2)
-
-
-def swinging() -> MultibodyPlant:
-    links = [link(name, 1.0) for name in ("base", "one", "two", "three")]
-    axes = ("0 1 0", "1 0 0", "0 1 0")
-    joints = [
-        joint(f"j{k}", name, child, axis)
-        for k, (name, child, axis) in enumerate(
-            zip(("base", "one", "two"), ("one", "two", "three"), axes, strict=True)
-        )
-    ]
-    plant = MultibodyPlant(0.0)
-    Parser(plant).AddModelsFromString(robot("swing", *links, *joints), ".urdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base"))
-    plant.Finalize()
-    return plant
-
-
-@pytest.mark.parametrize(
-    ("outputs", "forces"), [(["j0"], None), (["j0", "j1"], []), ([], ["c.force"])]
-)
-def test_what_it_cannot_steer_is_refused_in_words_that_fit(outputs, forces):
-    touching = [PointOnSurface("three", SURFACES[0], name="c")]
-    positions = [JointPositions(outputs)] if outputs else []
-    with pytest.raises(ModelError, match="positions"):
-        RobotModel.from_multibody(swinging(), touching, positions, forces=forces)

@@ -17,7 +17,6 @@ from pydrake.multibody.tree import (
     JacobianWrtVariable,
     LinearBushingRollPitchYaw,
     QuaternionFloatingJoint,
-    RevoluteJoint,
     WeldJoint,
 )
 from random_plants import (
@@ -27,7 +26,6 @@ from random_plants import (
     default_masses,
     one_body,
     random_context,
-    random_inertia,
     random_robot,
     revolute,
     state,
@@ -255,21 +253,6 @@ def test_a_wrong_expression_is_caught_on_construction(monkeypatch, function, bro
     monkeypatch.setattr(multibody, function, lambda *args: broken(right(*args)))
     with pytest.raises(ModelError, match=rf"^{quantity}.*e-0"):
         MultibodyExpressions(crane())
-
-
-def test_gravity_can_be_disabled_for_a_body_welded_to_a_heavy_one():
-    plant = MultibodyPlant(0.0)
-    instance = plant.AddModelInstance("balloon")
-    inertia = random_inertia(np.random.default_rng(2))
-    body = plant.AddRigidBody("body", plant.GetModelInstanceByName("DefaultModelInstance"), inertia)
-    light = plant.AddRigidBody("light", instance, inertia)
-    plant.AddJoint(RevoluteJoint("joint", plant.world_frame(), body.body_frame(), [0, 1, 0]))
-    plant.WeldFrames(body.body_frame(), light.body_frame(), RigidTransform([0.3, 0.2, 0.1]))
-    plant.set_gravity_enabled(instance, False)
-    plant.Finalize()
-    expressions = MultibodyExpressions(plant)
-    context = random_context(plant, np.random.default_rng(3))
-    assert_terms_agree(plant, context, terms_of(expressions), default_masses(expressions))
 
 
 def test_of_two_motors_on_a_joint_the_last_rotor_counts():

@@ -71,23 +71,6 @@ def test_the_motion_is_that_of_multibody_plant_with_the_force_of_friction_on_the
         assert_allclose(wrench[9:], -wrench[3:6], rtol=1e-12)
 
 
-def test_no_friction_leaves_no_trace_in_the_equations():
-    """Without it, not an operation more; with a coefficient of 0, the same motion."""
-    smooth, zero = touching("two_link"), frictional(0.0)
-    assert [p.name for p in smooth.constraints[0].parameters] == ["wall.position"]
-    assert not smooth.dae.contacts
-    assert not smooth.dae.frictional_contacts
-    values = []
-    for model in (smooth, zero):
-        plant = RobotPlant(model)
-        context = plant.CreateDefaultContext()
-        plant.GetInputPort("control").FixValue(context, [3.0, -4.0])
-        plant.set_consistent_state(context, [1.2, -1.6, 0.3, 0.4])
-        rate = plant.EvalTimeDerivatives(context).CopyToVector()
-        values.append([*rate, *plant.GetOutputPort("constraint_force").Eval(context)])
-    assert_allclose(values[1], values[0], rtol=1e-12)
-
-
 def test_numbers_of_friction_that_make_no_sense_are_refused():
     wall = Plane((1.2, 0, 0), (-1, 0, 0))
     with pytest.raises(ModelError, match=r"'surface\.friction'"):

@@ -118,38 +118,23 @@ def test_outside_of_the_paradox_a_rod_moves_as_by_hand(steep):
     assert force[0] == pytest.approx(expected, rel=1e-5)
 
 
-def follow(model, references, state, duration, friction=None, accuracy=1e-8):
-    """A run under a law; its own model has the model's friction, the plant may have another."""
-    law = TrackingLaw(model.dae, poles(-6.0))
-    loop = make_closed_loop(RobotPlant(model, structure=law.structure), law, references)
-    context = loop.diagram.CreateDefaultContext()
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    loop.plant.set_consistent_state(own, state)
-    if friction is not None:
-        loop.plant.set_parameter(own, "floor.friction", friction)
-    try:
-        simulate(loop.diagram, context, duration, error_controlled(accuracy))
-    finally:
-        record = loop.record(context)
-    return record
-
-
-def tilting(speed=-2.0):
-    """The rod slides at a constant speed and falls from 80 degrees to 40 within 4 s."""
-    path = SinusoidReference(np.deg2rad(60.0), np.deg2rad(20.0), np.pi / 4.0, np.pi / 2.0)
-    slide = SinusoidReference(0.0, speed / 1e-2, 1e-2)
-    return [slide, path, ConstantReference(5.0)]
-
-
 @pytest.mark.slow
 def test_a_run_that_reaches_the_edge_stops_there():
     """Under a law that knows the friction lambda stays 5 N, so b = -A lambda: beyond, two fit.
 
     tan a = (9 + 17^(1/2)) / 4 where 3 mu t = t^2 + 4 with mu = 1.5, and a(t) is as commanded.
     """
-    start = sliding(np.deg2rad(80.0))
+    model = rod(1.5, np.deg2rad(80.0))
+    law = TrackingLaw(model.dae, poles(-6.0))
+    # It slides at a constant speed and falls from 80 degrees to 40 within 4 s.
+    path = SinusoidReference(np.deg2rad(60.0), np.deg2rad(20.0), np.pi / 4.0, np.pi / 2.0)
+    references = [SinusoidReference(0.0, -200.0, 1e-2), path, ConstantReference(5.0)]
+    loop = make_closed_loop(RobotPlant(model, structure=law.structure), law, references)
+    context = loop.diagram.CreateDefaultContext()
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_consistent_state(own, sliding(np.deg2rad(80.0)))
     with pytest.raises(PainleveError) as caught:
-        follow(rod(1.5, np.deg2rad(80.0)), tilting(), start, 3.5)
+        simulate(loop.diagram, context, 3.5, error_controlled(1e-8))
     angle = np.arctan((9.0 + np.sqrt(17.0)) / 4.0)
     when = np.arccos((np.rad2deg(angle) - 60.0) / 20.0) / (np.pi / 4.0)
     assert caught.value.time == pytest.approx(when, abs=1e-5)

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import SimulatorConfig
+from arms import fixed_step
 from runs import some
 
 from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
@@ -91,9 +91,7 @@ def test_when_it_ends_does_not_depend_on_units(size, period):
     It is looked at every 32nd step, of period / 50 here.
     """
     loop, context = unstable_inside(size, period)
-    config = SimulatorConfig(
-        integration_scheme="runge_kutta3", max_step_size=period / 50.0, use_error_control=False
-    )
+    config = fixed_step(period / 50.0, "runge_kutta3")
     with pytest.raises(SimulationError, match=r"\bb\b") as caught:
         simulate(loop.diagram, context, 40.0 * period, config)
     expected = 13.0 * np.log(10.0)

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from arms import fixed_step
 from c_controller import compile_c
 from c_loop import CLoop, code_of
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
@@ -17,9 +18,7 @@ from drake_dae.running.export import fixed_steps
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 
 STEP = 0.001
-CONFIG = SimulatorConfig(
-    integration_scheme="runge_kutta3", use_error_control=False, max_step_size=STEP
-)
+CONFIG = fixed_step(STEP, "runge_kutta3")
 SAMPLED = "sampling={period: 0.001}"
 EVERYTHING = (
     "sampling={period: 0.002, delay: 0.003}",

@@ -1,23 +1,21 @@
-"""Running a diagram: settings, statistics, progress, interruption, failure."""
+"""Running a diagram: settings, statistics, interruption, failure."""
 
-import io
 import os
 import signal
-import sys
 import threading
 
 import numpy as np
 import pytest
+from arms import fixed_step
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from runs import scenario
 
-from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
-from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae import DaePlant, DaeSystem, build_scenario
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.interruption import ENDING_SIGNALS
 from drake_dae.running.simulate import check_config, simulate
-from drake_dae.scenario.shipped import find_scenario
 
 
 class Ramp(LeafSystem):
@@ -42,15 +40,12 @@ def ramp(mark=np.inf, happening=None):
     return diagram, diagram.CreateDefaultContext(), logger
 
 
-def fixed(step=0.125):
-    return SimulatorConfig(
-        integration_scheme="runge_kutta3", max_step_size=step, use_error_control=False
-    )
+STEPS = fixed_step(0.125, "runge_kutta3")
 
 
 def test_statistics_and_end_state():
     diagram, context, logger = ramp()
-    run = simulate(diagram, context, 2.0, fixed())
+    run = simulate(diagram, context, 2.0, STEPS)
     assert (run.simulated_time, run.steps, run.interrupted) == (2.0, 16, None)
     assert run.times_real_time == pytest.approx(2.0 / run.wall_time)
     assert context.get_time() == 2.0
@@ -73,7 +68,7 @@ def test_settings_reach_the_integrator():
 def test_duration_is_checked(duration):
     diagram, context, _ = ramp()
     with pytest.raises(ModelError, match="duration"):
-        simulate(diagram, context, duration, fixed())
+        simulate(diagram, context, duration, STEPS)
     assert context.get_time() == 0.0
 
 
@@ -132,7 +127,7 @@ def test_a_signal_ends_the_run_after_its_step(number):
             os.kill(os.getpid(), number)
 
     diagram, context, logger = ramp(0.5, press)
-    run = simulate(diagram, context, 2.0, fixed())
+    run = simulate(diagram, context, 2.0, STEPS)
     assert sent
     assert run.interrupted == number
     # The signal comes in the step from 0.5 to 0.625, at one of its stages.
@@ -156,7 +151,7 @@ def test_a_second_signal_is_an_exception_and_the_log_is_kept(second):
 
     diagram, context, logger = ramp(0.5, press_twice)
     with pytest.raises(KeyboardInterrupt) as caught:
-        simulate(diagram, context, 2.0, fixed())
+        simulate(diagram, context, 2.0, STEPS)
     assert caught.value.args == (second,)
     assert logger.FindLog(context).sample_times()[-1] == 0.5
     assert signal.getsignal(signal.SIGINT) is before
@@ -165,50 +160,10 @@ def test_a_second_signal_is_an_exception_and_the_log_is_kept(second):
 def test_runs_outside_of_the_main_thread():
     """Where Python allows no signal handler."""
     result = []
-    thread = threading.Thread(target=lambda: result.append(simulate(*ramp()[:2], 1.0, fixed())))
+    thread = threading.Thread(target=lambda: result.append(simulate(*ramp()[:2], 1.0, STEPS)))
     thread.start()
     thread.join()
     assert result[0].simulated_time == 1.0
-
-
-# Failure.
-
-
-def two_link(*settings):
-    scenario = load_scenario(find_scenario("two_link_wall"), settings)
-    return *build_scenario(scenario), scenario
-
-
-def test_a_start_off_the_manifold_is_refused():
-    loop, context, scenario = two_link()
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    loop.plant.set_state(own, loop.plant.state(own) + 0.1)
-    with pytest.raises(InconsistentStateError) as caught:
-        simulate(loop.diagram, context, 0.5, scenario.integrator)
-    assert np.abs(caught.value.residual).max() > 0.01
-
-
-# Progress.
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_a_bar_on_a_terminal(monkeypatch):
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    simulate(*ramp()[:2], 2.0, fixed(), progress=True)
-    last = terminal.getvalue().rstrip("\n").split("\r")[-1]
-    assert last.startswith("100%|")
-    assert "2.00/2.00 s" in last
-    assert last.endswith(" x real time")
-
-
-def test_nothing_where_there_is_no_terminal(capsys):
-    simulate(*ramp()[:2], 2.0, fixed(1.0), progress=True)
-    assert capsys.readouterr().err == ""
 
 
 def test_a_state_that_escapes_in_finite_time_ends_the_run():

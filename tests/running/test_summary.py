@@ -87,17 +87,6 @@ def test_data_says_the_same():
     assert (data["steps"], data["missed"], data["interrupted"]) == (123, False, False)
 
 
-def test_what_real_contact_explains_is_one_remark():
-    far = np.add(PREDICTED, [[0.0, 0.0], [0.4, 0.0], [0.0, 0.0]])
-    far = record(tracking_error=(far.tolist(), OUTPUTS))
-    text = summary(far, reasons=["the contact is compliant"]).text
-    assert text.startswith("GOOD")
-    assert len([line for line in text.splitlines() if "compliant" in line]) == 1
-    found = summary(far, reasons=[])
-    assert found.text.startswith("UNDECIDED")
-    assert found.missed
-
-
 def test_cut_off_controls_say_for_how_long():
     excess = ([[0.0, 0.0], [3.0, 0.0], [0.0, 0.0]], [("motor1", "N m"), ("motor2", "N")])
     (row,) = [r for r in table(summary(record(excess=excess)).text, "force") if r[0] == "motor1"]

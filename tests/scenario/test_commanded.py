@@ -15,30 +15,21 @@ FIXED = SimulatorConfig(
 )
 
 
-def parameter_names(loop):
-    """ "block.parameter" -> the block, and the place among its numeric parameters."""
-    return {
-        f"{system.get_name()}.{signal.name}": (system, i)
-        for system in Leaves.of(loop.diagram).systems
-        if isinstance(system, TracedSystem)
-        for i, signal in enumerate(system.block.signals.get("parameters", ()))
-    }
-
-
-def set_inputs(loop, context, changes):
-    """Sets the parameters in a context whose names end with those of `changes`."""
-    for ending, value in changes.items():
-        places = [p for name, p in parameter_names(loop).items() if name.endswith(ending)]
-        assert places, ending
-        for system, i in places:
-            own = system.GetMyMutableContextFromRoot(context)
-            own.get_mutable_numeric_parameter(0).SetAtIndex(i, value)
-
-
 def jumped(built, duration, **changes):
     """A record of a run with jumps of inputs, given by parts of their names, at its start."""
     context = built.context.Clone()
-    set_inputs(built.loop, context, {k.replace("__", "."): x for k, x in changes.items()})
+    traced = [s for s in Leaves.of(built.loop.diagram).systems if isinstance(s, TracedSystem)]
+    for key, value in changes.items():
+        places = [
+            (system, i)
+            for system in traced
+            for i, signal in enumerate(system.block.signals.get("parameters", ()))
+            if f"{system.get_name()}.{signal.name}".endswith(key.replace("__", "."))
+        ]
+        assert places, key
+        for system, i in places:
+            own = system.GetMyMutableContextFromRoot(context)
+            own.get_mutable_numeric_parameter(0).SetAtIndex(i, value)
     return run(built.loop, context, duration, FIXED)
 
 

@@ -7,8 +7,8 @@ import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
-from scenario_texts import lever, run, two_link
-from two_arms import GRASP
+from runs import scenario as shipped
+from scenario_texts import run
 
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
@@ -81,18 +81,20 @@ def test_files_in_settings_of_a_shipped_scenario_are_in_the_working_directory(
 ):
     (tmp_path / "path.csv").write_text("time,y\n0,0\n1,0.1\n2,0\n")
     monkeypatch.chdir(tmp_path)
-    chosen = two_link("references={tool.y: !Csv {file: path.csv, columns: [y]}}")
+    chosen = shipped("two_link_wall", "references={tool.y: !Csv {file: path.csv, columns: [y]}}")
     assert chosen.references["tool.y"].table.shape == (3, 2)
 
 
 def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
-    path = lever(tmp_path / "robots")
-    (tmp_path / "scenarios").mkdir()
+    for folder in ("robots", "scenarios"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "robots" / "arm.urdf").write_text(dd.shipped_model("two_link_arm.urdf").read_text())
+    text, models = find_scenario("two_link_wall").read_text(), "package://drake_dae_models/"
     away = tmp_path / "scenarios" / "away.yaml"
-    away.write_text(path.read_text().replace("lever.urdf", "../robots/lever.urdf"))
+    away.write_text(text.replace(f"{models}two_link_arm.urdf", "../robots/arm.urdf"))
     monkeypatch.chdir("/")
-    scenario = dd.load_scenario(away)
-    assert scenario.robot.file == str((tmp_path / "robots" / "lever.urdf").resolve())
+    scenario = dd.load_scenario(away, ["duration=0.1"])
+    assert scenario.robot.file == str((tmp_path / "robots" / "arm.urdf").resolve())
     assert run(scenario)[1].time[-1] == 0.1
 
 
@@ -116,33 +118,17 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
     ],
 )
 def test_settings(setting, read):
-    assert read(two_link(setting))
+    assert read(shipped("two_link_wall", setting))
 
 
 def test_settings_reach_names_with_dots_in_lists():
     task = "task={phases: [!Move {references: {tool.z: 0.3}, duration: 1}]}"
-    (phase,) = two_link(task, "task.phases.0.references.tool.z=0.4").task.phases
+    (phase,) = shipped("two_link_wall", task, "task.phases.0.references.tool.z=0.4").task.phases
     assert phase.references == {"tool.z": 0.4}
 
 
-def test_outputs():
-    """The outputs of seven_joint_wall in other words."""
-    settings = [
-        "outputs.0=!SurfaceCoordinates {constraint: wall}",
-        "start.errors={wall.across: 0.02}",
-        "references={wall: !Constant {values: [0, 0.6]}, tool.z_axis: 0, 'joint3, joint7': 0, "
-        "wall.force: 20}",
-    ]
-    loop, context = dd.build_scenario(dd.load_scenario(find_scenario("seven_joint_wall"), settings))
-    names = [signal.name for signal in loop.plant.dae.output_signals]
-    assert names[:3] == ["wall.along", "wall.across", "tool.z_axis.y"]
-    assert names[3:] == ["tool.z_axis.z", "joint3", "joint7", "wall.force"]
-    error = loop.diagram.GetOutputPort("tracking_error").Eval(context)
-    np.testing.assert_allclose(error, [0, 0.02, 0, 0, 0, 0, 0], atol=1e-9)
-
-
 def test_a_run_begins_at_its_start_time_with_the_errors_there():
-    scenario = two_link("integrator.start_time=3", "duration=0.5")
+    scenario = shipped("two_link_wall", "integrator.start_time=3", "duration=0.5")
     _, record, distance = run(scenario)
     assert record.time[0] == 3.0
     assert record.time[-1] == 3.5
@@ -150,21 +136,6 @@ def test_a_run_begins_at_its_start_time_with_the_errors_there():
     assert record["tracking_error"][0, 0] == pytest.approx(0.05, abs=1e-9)
     # The accuracy is 1e-8 in a step.
     assert np.max(distance) < 1e-6
-
-
-def test_weld():
-    """The shipped scenario has the weld of tests/support/two_arms.py."""
-    weld = dd.load_scenario(find_scenario("two_arms")).constraints[0].make(())
-    assert (weld.frame_a, weld.frame_b, weld.name) == (GRASP.frame_a, GRASP.frame_b, "grasp")
-    np.testing.assert_allclose(
-        weld.pose.GetAsMatrix4(), GRASP.pose.GetAsMatrix4(), rtol=0, atol=1e-15
-    )
-    # A pose that is left out is that of frames that coincide.
-    plain = dd.load_scenario(
-        find_scenario("two_arms"),
-        ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
-    )
-    assert plain.constraints[0] == WeldedFramesForm("left::tool", "right::tool", Pose())
 
 
 TILTED = (
@@ -175,11 +146,11 @@ TILTED = (
 
 def test_bounds_of_parameters_are_those_at_which_the_structure_is_looked_at():
     """At a = 0 the wall is y = 0, along which the whole arm moves: A(x) is zero."""
-    loop, _ = dd.build_scenario(two_link(TILTED, "bounds={wall.a: [0.5, 2]}"))
+    loop, _ = dd.build_scenario(shipped("two_link_wall", TILTED, "bounds={wall.a: [0.5, 2]}"))
     for system in (loop.plant.dae, loop.controller.law.system):
         assert {p.name: p.bounds for p in system.parameters if p.bounds} == {"wall.a": (0.5, 2.0)}
     with pytest.raises(ScenarioError, match=r"A\(x\).*'wall\.a'"):
-        dd.build_scenario(two_link(TILTED, "bounds={wall.a: [0, 2]}"))
+        dd.build_scenario(shipped("two_link_wall", TILTED, "bounds={wall.a: [0, 2]}"))
 
 
 def test_a_model_is_found_by_its_name():

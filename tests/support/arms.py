@@ -76,10 +76,8 @@ def law(name: str, gains: GainDesign | None = None) -> TrackingLaw:
     return TrackingLaw(arm(name).model.dae, gains or poles(-4.0), structure=arm(name).structure)
 
 
-def fixed_step(step: float = 1e-3) -> SimulatorConfig:
-    return SimulatorConfig(
-        integration_scheme="runge_kutta5", max_step_size=step, use_error_control=False
-    )
+def fixed_step(step: float = 1e-3, scheme: str = "runge_kutta5") -> SimulatorConfig:
+    return SimulatorConfig(integration_scheme=scheme, max_step_size=step, use_error_control=False)
 
 
 def error_controlled(accuracy: float) -> SimulatorConfig:

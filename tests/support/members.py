@@ -4,50 +4,16 @@ They show what it takes to add one, and keep the contracts as those of the packa
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 from pydrake.systems.framework import BasicVector, LeafSystem
 
-from drake_dae import ForceOutput, PointOnSurface
+from drake_dae import ForceOutput
 from drake_dae.dae import Signal
-from drake_dae.robots import (
-    Application,
-    AttachedStage,
-    Constraint,
-    Stage,
-    Surface,
-    diagonal_parameter,
-)
+from drake_dae.robots import AttachedStage, Constraint, Stage, Surface, diagonal_parameter
 from drake_dae.systems import Controller, Plant
 from drake_dae.systems.phases import Condition, Phase
-
-
-@dataclass(frozen=True)
-class FrictionalPoint(PointOnSurface):
-    """A point on a surface with friction whose numbers are no parameters."""
-
-    coefficient: float = 0.3
-    speed: float = 0.05
-    is_ideal: ClassVar[bool] = False
-
-    def _sliding(self, kinematics):
-        """s = v_t / sqrt(|v_t|^2 + speed^2), shape (3, 1)."""
-        normal = self.surface.unit_normal(self.offset(kinematics))
-        velocity = kinematics.velocity(self.frame, self.point)
-        across = velocity - normal * ca.dot(normal, velocity)
-        return across / ca.sqrt(ca.sumsqr(across) + self.speed**2)
-
-    def reaction(self, kinematics, constraint_force):
-        frictional = -self.coefficient * constraint_force * self._sliding(kinematics)
-        pushed = super().reaction(kinematics, constraint_force)
-        return pushed + kinematics.push(self.frame, frictional, self.point)
-
-    def applications(self, kinematics):
-        (own,) = super().applications(kinematics)
-        frictional = -self.coefficient * self._sliding(kinematics)
-        return (Application(own.point, own.force_axes + frictional, own.moment_axes, self.frame),)
 
 
 @dataclass(frozen=True)

@@ -149,3 +149,15 @@ def same_records(one, other):
     for name, recorded in one.signals.items():
         np.testing.assert_array_equal(recorded.values, other[name])
         assert recorded.signals == other.signals[name].signals
+
+
+def close_records(found, wanted, tolerance, rows=slice(None), least=1.0):
+    """Asserts that rows are equal to a share of a signal's largest value, or of the least size."""
+    for name, recorded in wanted.signals.items():
+        np.testing.assert_allclose(
+            found[name][rows],
+            recorded.values[rows],
+            rtol=0.0,
+            atol=tolerance * np.abs(recorded.values).max(initial=least),
+            err_msg=name,
+        )

@@ -1,42 +1,9 @@
-"""Scenarios as text: that of two links at a wall, and a lever of one's own."""
+"""Scenarios as text, of two links at a wall."""
 
 import numpy as np
 from runs import run_scenario
 
-from drake_dae import load_scenario
 from drake_dae.scenario.shipped import find_scenario
-
-ONE_JOINT = """<robot name="lever"><link name="world"/>
-  <link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="2"/>
-    <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <visual><geometry>{shape}</geometry></visual></link>
-  <joint name="joint" type="revolute"><parent link="world"/><child link="arm"/>
-    <axis xyz="0 -1 0"/><limit lower="-3" upper="3" velocity="3" effort="40"/></joint>
-  <frame name="tip" link="arm" xyz="1 0 0" rpy="0 0 0"/>{drive}</robot>"""
-
-
-DRIVE = """<transmission><type>transmission_interface/SimpleTransmission</type>
-  <joint name="joint"/><actuator name="motor"/></transmission>"""
-
-
-LEVER = """robot: {file: lever.urdf}
-constraints:
-- {name: wall, frame: tip, surface: !Plane {point: [0.8, 0, 0], normal: [-1, 0, 0]}}
-references: {wall.force: 10}
-start: {positions: {joint: 0.6}}
-duration: 0.1
-"""
-
-
-def two_link(*settings):
-    return load_scenario(find_scenario("two_link_wall"), settings)
-
-
-def lever(folder, shape='<box size="1 0.1 0.1"/>', drive=DRIVE):
-    folder.mkdir(exist_ok=True)
-    (folder / "lever.urdf").write_text(ONE_JOINT.format(shape=shape, drive=drive))
-    (folder / "lever.yaml").write_text(LEVER)
-    return folder / "lever.yaml"
 
 
 def run(scenario):

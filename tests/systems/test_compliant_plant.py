@@ -1,5 +1,6 @@
 """Compliant contact as traced equations, against Drake's MultibodyPlant and closed forms."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
@@ -71,19 +72,20 @@ def drawn(shape: str):
     return dd.Sphere(center=center, radius=radius), (Ball(radius), RigidTransform(center))
 
 
+def on_arm(surface, time_step: float = 0.0, **material: float) -> dd.CompliantPlant:
+    """The seven-joint arm on a surface."""
+    links = arm("seven_joint").model
+    wall = dd.PointOnSurface("tool", surface, name="wall", friction=0.3)
+    model = dd.RobotModel(
+        links.links, [wall], links.outputs, links.nominal_positions, forces=["wall.force"]
+    )
+    return dd.CompliantPlant(model, PointMaterial(time_step, **{**MATERIAL, **material}))
+
+
 @cache
 def pair(shape: str, time_step: float, dissipation: float = 2.0) -> Pair:
     surface, (form, pose) = drawn(shape)
-    links = arm("seven_joint").model
-    model = dd.RobotModel(
-        links.links,
-        [dd.PointOnSurface("tool", surface, name="wall", friction=0.3)],
-        links.outputs,
-        links.nominal_positions,
-        forces=["wall.force"],
-    )
-    material = PointMaterial(time_step, **{**MATERIAL, "dissipation": dissipation})
-    plant = dd.CompliantPlant(model, material)
+    plant = on_arm(surface, time_step, dissipation=dissipation)
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(time_step=time_step, contact_model="point")
     drake, scene = AddMultibodyPlant(config, builder)
@@ -187,16 +189,6 @@ def stepped(plant, state, control):
     return plant.state(context), plant.GetOutputPort("contact_force").Eval(context)
 
 
-def on_arm(surface, radius: float) -> dd.CompliantPlant:
-    """The seven-joint arm on a surface."""
-    links = arm("seven_joint").model
-    wall = dd.PointOnSurface("tool", surface, name="wall", friction=0.3)
-    model = dd.RobotModel(
-        links.links, [wall], links.outputs, links.nominal_positions, forces=["wall.force"]
-    )
-    return dd.CompliantPlant(model, PointMaterial(0.0, **{**MATERIAL, "radius": radius}))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_distance_that_is_exact_on_the_surface_alone_will_do(inside):
@@ -206,8 +198,8 @@ def test_a_distance_that_is_exact_on_the_surface_alone_will_do(inside):
     leaves k d^2 / (2 R) = 0.05 N; at the center of the ball it would be 0.4 mm off, or 40 N.
     """
     center = (0.7 - 0.1, 0.0, 0.6) if inside else (0.7 + 0.1, 0.0, 0.6)
-    sphere = on_arm(dd.Sphere(center, 0.1, inside=inside), 0.01)
-    ellipsoid = on_arm(dd.Ellipsoid(center, (0.1, 0.1, 0.1), inside=inside), 0.01)
+    sphere = on_arm(dd.Sphere(center, 0.1, inside=inside))
+    ellipsoid = on_arm(dd.Ellipsoid(center, (0.1, 0.1, 0.1), inside=inside))
     found = []
     for state, _ in near_contact(sphere, 50, 3):
         for plant in (sphere, ellipsoid):
@@ -221,15 +213,15 @@ def test_a_distance_that_is_exact_on_the_surface_alone_will_do(inside):
 @pytest.mark.slow
 def test_a_ball_that_its_surface_has_no_room_for_is_refused():
     hollow = dd.Ellipsoid((0.7 - 0.05, 0.0, 0.6), (0.05, 0.05, 0.05), inside=True)
-    plant = on_arm(hollow, 0.04)
+    plant = on_arm(hollow, radius=0.04)
     with pytest.raises(ModelError, match=r"0.06.*'wall'"):
-        on_arm(hollow, 0.06)
+        on_arm(hollow, radius=0.06)
     context = plant.CreateDefaultContext()
     with pytest.raises(ModelError, match="'wall'"):
         plant.set_contact(context, replace(plant.material, radius=0.06))
 
 
-def sled(stop: float = np.inf) -> dd.RobotModel:
+def sled(stop: float = np.inf, exogenous: Sequence[str] = ()) -> dd.RobotModel:
     """A block that slides along x and z, on a floor at z = 0, pulled along x and pressed by u."""
     plant = MultibodyPlant(0.0)
     inertia = SpatialInertia(2.0, np.zeros(3), UnitInertia.SolidCube(0.1))
@@ -245,7 +237,7 @@ def sled(stop: float = np.inf) -> dd.RobotModel:
     plant.Finalize()
     floor = dd.Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
     contact = dd.PointOnSurface("block", floor, name="floor", friction=0.5)
-    return dd.RobotModel.from_multibody(plant, [contact], [], forces=[])
+    return dd.RobotModel.from_multibody(plant, [contact], [], forces=[], exogenous=exogenous)
 
 
 PRESSED = [0.0, -1e-3, 0.0, 0.0]
@@ -321,20 +313,8 @@ def test_a_contact_opens_and_strikes_with_the_restitution_of_hunt_and_crossley()
 @pytest.mark.parametrize("time_step", [0.0, 1e-3])
 def test_a_moving_floor_takes_the_sled_along(time_step):
     """A floor at 0.2 m/s pulls the sled with mu N = 5 N until it is as fast, to within v_s."""
-    plant = dd.CompliantPlant(
-        dd.RobotModel(
-            sled().links,
-            [
-                dd.PointOnSurface(
-                    "block", dd.Plane([0, 0, 0], [0, 0, 1]), name="floor", friction=0.5
-                )
-            ],
-            [],
-            forces=[],
-            exogenous=["floor.position"],
-        ),
-        PointMaterial(time_step, stiffness=1e4),
-    )
+    robot = sled(exogenous=["floor.position"])
+    plant = dd.CompliantPlant(robot, PointMaterial(time_step, stiffness=1e4))
     moving = np.zeros(plant.exogenous_layout.reference_size)
     moving[1] = 0.2  # x, x', ...
     diagram, context, own = driven(plant, PRESSED, control=[0.0, -10.0], exogenous=moving)
@@ -342,20 +322,6 @@ def test_a_moving_floor_takes_the_sled_along(time_step):
     assert_allclose(plant.state(own)[2], 0.05 * 5.0 / 2.1, rtol=0.03)
     dd.simulate(diagram, context, 0.2, fixed_step(1e-4))
     assert_allclose(plant.state(own)[2], 0.2, atol=1e-4)
-
-
-def test_numbers_of_the_contact_change_in_a_context():
-    """As if the plant had been made with them."""
-    model = arm("two_link").model
-    plant = dd.CompliantPlant(model, PointMaterial(friction=0.2))
-    other = PointMaterial(friction=0.6, stiffness=3e4, radius=0.02)
-    made = dd.CompliantPlant(model, other)
-    context = plant.CreateDefaultContext()
-    plant.set_contact(context, other)
-    wanted = made.CreateDefaultContext().get_numeric_parameter(0).value()
-    np.testing.assert_array_equal(context.get_numeric_parameter(0).value(), wanted)
-    with pytest.raises(ModelError, match="time_step"):
-        plant.set_contact(context, PointMaterial(time_step=0.0, friction=0.6))
 
 
 def test_a_joint_at_its_limit_ends_the_run_with_a_reason():

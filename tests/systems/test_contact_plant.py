@@ -26,7 +26,6 @@ CONTACT = (
     "law.constraint_damping=!Poles {all: [-50.0]}",
     "law.gains.all=[-25.0]",
 )
-ONE_LATE = "sampling={period: 1.0e-3, delay: 1.0e-3}"
 
 
 def pressing(*settings: str) -> Scenario:
@@ -99,16 +98,6 @@ def test_contact_forces_of_several_model_instances_are_those_of_drakes_results()
     wanted = np.array([info.contact_force() for info in infos])
     assert_allclose(np.abs(found), np.abs(wanted), rtol=0.0, atol=1e-9)
     assert found[:, 2].min() > 5.0
-
-
-def test_friction_is_that_of_the_wall():
-    """F_t = 0.3 F_n while it slides. Drake takes the normal force of the step before for it."""
-    found = two_link(ONE_LATE, "plant.friction=0.3", "duration=0.5")
-    _, _, record = run_scenario(found)
-    force = record["contact_force"][record.time > 0.1]
-    assert np.all(np.abs(force[:, 1]) < 1e-6)  # It moves in a plane.
-    assert_allclose(np.abs(force[:, 2] / force[:, 0]), 0.3, rtol=4e-3)
-    assert_allclose(-force[:, 0], record["constraint_force"][record.time > 0.1, 0], rtol=1e-12)
 
 
 @pytest.mark.slow

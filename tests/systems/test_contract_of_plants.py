@@ -64,19 +64,24 @@ def plant(request):
     return MEMBERS[request.param]()
 
 
-def run_of(plant, duration=0.02):
-    """The plant, its diagram, its context and what was logged, with a control that stands still."""
-    builder = DiagramBuilder()
-    builder.AddSystem(plant)
-    source = builder.AddSystem(ConstantVectorSource([20.0, 10.0]))
-    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
-    ports = {
+def signals_of(plant):
+    """Name of an output port -> its signals."""
+    return {
         "state": plant.dae.state_signals,
         "constraint_force": plant.dae.force_signals,
         "constraint_residual": plant.structure.manifold.residual_signals,
         "controlled_output": plant.dae.output_signals,
         **plant.further_signals,
     }
+
+
+def run_of(plant, duration=0.02):
+    """The plant, its diagram, its context and what was logged, with a control that stands still."""
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(ConstantVectorSource([20.0, 10.0]))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    ports = signals_of(plant)
     log = log_steps(builder, list(map(plant.GetOutputPort, ports)), plant)
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
@@ -87,16 +92,8 @@ def run_of(plant, duration=0.02):
 
 
 def test_rule_1_ports(plant):
-    dae = plant.dae
-    assert plant.GetInputPort("control").size() == dae.num_controls
-    sizes = {
-        "state": dae.state_signals,
-        "constraint_force": dae.force_signals,
-        "constraint_residual": plant.structure.manifold.residual_signals,
-        "controlled_output": dae.output_signals,
-        **plant.further_signals,
-    }
-    for name, signals in sizes.items():
+    assert plant.GetInputPort("control").size() == plant.dae.num_controls
+    for name, signals in signals_of(plant).items():
         assert plant.GetOutputPort(name).size() == len(signals), name
 
 

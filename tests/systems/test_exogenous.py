@@ -51,9 +51,7 @@ def moving(plant, control):
     builder.Connect(generator.get_output_port(), plant.GetInputPort("exogenous"))
     diagram = builder.Build()
     simulator = Simulator(diagram)
-    config = error_controlled(1e-11)
-    config.integration_scheme = "runge_kutta5"
-    ApplySimulatorConfig(config, simulator)
+    ApplySimulatorConfig(error_controlled(1e-11), simulator)
     own = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     plant.GetInputPort("control").FixValue(own, control)
     return simulator, own
@@ -118,9 +116,7 @@ def test_the_law_keeps_its_prediction_while_the_constraint_moves():
     goal = dd.ExpressionReference(lambda t: [0.5 + 0.2 * ca.sin(t), 3 + ca.cos(2 * t)])
     loop = dd.make_closed_loop(dd.DaePlant(system), law, [goal], LoopSettings(exogenous=[LENGTH]))
     simulator = Simulator(loop.diagram)
-    config = error_controlled(1e-10)
-    config.integration_scheme = "runge_kutta5"
-    ApplySimulatorConfig(config, simulator)
+    ApplySimulatorConfig(error_controlled(1e-10), simulator)
     context = simulator.get_mutable_context()
     loop.plant.set_consistent_state(
         loop.plant.GetMyMutableContextFromRoot(context), [0.2, -1, 0, 0]

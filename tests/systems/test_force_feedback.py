@@ -6,7 +6,7 @@ from arms import arm, consistent_states, fixed_step, law, touching
 from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource, Sine
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource
 from runs import some
 
 import drake_dae as dd
@@ -82,28 +82,6 @@ def test_measured_force_removes_the_static_error_behind_motors(stage):
     # The slowest mode is the pole at -10: exp(-30) of a few newtons.
     assert abs(feedback[-1, 1]) < 1e-6 * abs(without[-1, 1])
     np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
-
-
-def test_with_a_right_model_measured_force_changes_nothing():
-    """lambda is the model's lambda then: the law is the same to round-off."""
-    for stages in ([MOTORS], [dd.FlexibleJoints(8000.0, inertia=1.0)]):
-        model = touching("two_link", stages)
-        plain = dd.TrackingLaw(model.dae, dd.poles(-4.0))
-        fed = dd.TrackingLaw(
-            model.dae, dd.poles(-4.0), structure=plain.structure, measured_force=True
-        )
-        plant = dd.RobotPlant(model, structure=plain.structure)
-        context = plant.CreateDefaultContext()
-        random = np.random.default_rng(5)
-        for state in plain.structure.states[:4]:
-            plant.set_state(context, state)
-            force = plant.GetOutputPort("constraint_force").Eval(context)
-            reference = random.standard_normal(len(plain.reference_signals))
-            np.testing.assert_allclose(
-                fed.control(state, reference, measured_force=force),
-                plain.control(state, reference),
-                rtol=1e-8,
-            )
 
 
 @pytest.mark.equation(59)
@@ -198,13 +176,6 @@ def test_a_sensor_starts_as_if_it_had_felt_a_constant_force(lag, period):
             simulator.AdvanceTo(time)
         shown = sensor.GetOutputPort("measured_force").Eval(own)
         np.testing.assert_allclose(shown, [8.5, 2.8], rtol=1e-14)
-
-
-def test_sampling_holds():
-    times, values = sensed(dd.ForceSensor(1, sample_period=0.1), Sine(1.0, 3.0, 0.0, 1), 1.0)
-    # Between its samples, at the middle of each period, it shows the last one.
-    middle = np.isclose(times % 0.1, 0.05)
-    np.testing.assert_allclose(values[0, middle], np.sin(3.0 * (times[middle] - 0.05)), atol=1e-9)
 
 
 @pytest.mark.slow

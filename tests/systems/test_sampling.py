@@ -1,7 +1,6 @@
 """Sampled laws and drives with limits, against maps written by hand and the continuous law."""
 
 import re
-from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from arms import arm, error_controlled
 from numpy.testing import assert_allclose
 from pydrake.systems.analysis import Simulator
-from runs import run, run_scenario, scenario
+from runs import run, scenario
 
 import drake_dae as dd
 from drake_dae.diagrams import LoopSettings
@@ -88,27 +87,6 @@ def test_run_that_goes_on_keeps_what_is_held():
     dd.simulate(loop.diagram, context, 10.1 * T, on)
     _, _, record = pursue(dd.ConstantReference(0.0), half, whole)
     assert_allclose(loop.record(context)["state"][-1], record["state"][-1], atol=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "periods", [(8e-3, 4e-3), pytest.param((4e-3, 2e-3, 1e-3), marks=pytest.mark.slow)]
-)
-def test_error_falls_with_the_period(periods):
-    """First order, of position and force: half the period leaves half of what theory lacks.
-
-    The next order changes that by a few percent at 8 ms, and less below.
-    """
-    errors = []
-    for period in periods:
-        found = scenario("two_link_wall", f"sampling={{period: {period}}}", "duration=1.5")
-        found.start.errors.clear()
-        loop, _, record = run_scenario(found)
-        off = record["tracking_error"] - loop.predicted_error(record)
-        errors.append(np.abs(off[record.time > 0.3]).max(axis=0))
-    for coarse, fine in pairwise(errors):
-        assert_allclose(coarse / fine, 2.0, rtol=0.05)
-    assert np.all(errors[-1] < [1e-3, 0.2])
 
 
 def test_limits_cut_and_tell_when():

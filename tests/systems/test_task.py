@@ -128,17 +128,6 @@ def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
     assert_allclose(loop.record(context)["distance"][-1, 1], 0.0, atol=1e-3)
 
 
-def test_task_may_begin_in_contact():
-    loop = task_loop(
-        [dd.Press(5.0, over=0.05), dd.Release(over=0.05), dd.Retreat(0.001, over=0.05)]
-    )
-    context = started(loop, distance=0.0)
-    run_on(loop, context, 0.17)
-    record = loop.record(context)
-    assert record["constraint_force"].max() == pytest.approx(5.0, abs=0.2)
-    assert loop.changes(loop.record(context))[-1].phase == "done"
-
-
 def test_law_may_have_another_wall(whole):
     """It believes the wall 5 mm nearer, and comes as far as its wall is with the wrong distance."""
     loop, _, _ = whole

@@ -228,51 +228,6 @@ def root(residual, gradients, start) -> tuple[Array, bool]:
     return newton(np.array(start, float), lambda x: shortest_steps(gradients(x), residual))
 
 
-def test_a_root_is_found_to_round_off():
-    """Kepler's equation, solved by a fixed-point iteration that contracts by 1/5."""
-    expected = 1.0
-    for _ in range(40):
-        expected = 1.0 + 0.2 * np.sin(expected)
-    found, converged = root(
-        lambda x: x - 0.2 * np.sin(x) - 1.0, lambda x: np.array([1 - 0.2 * np.cos(x)]), [0.0]
-    )
-    assert converged
-    # A rounding of each.
-    np.testing.assert_allclose(found, expected, rtol=4e-16)
-
-
-def test_convergence_is_quadratic():
-    """From 10% off a circle: errors 1e-1, 1e-2, 1e-4, 1e-8, 1e-16, so that four steps do."""
-    iterates = []
-
-    def gradients(x: Array) -> Array:
-        iterates.append(x)
-        return 2 * x[None]
-
-    found, converged = root(lambda x: np.array([x @ x - 4]), gradients, [2.2, 0.3])
-    assert converged
-    np.testing.assert_allclose(np.hypot(*found), 2.0, rtol=4e-16)
-    assert len(iterates) <= 4
-
-
-@pytest.mark.parametrize("scales", [(1.0, 1.0), (1e-9, 1e7)])
-def test_the_equations_may_be_in_any_units(scales):
-    """x^2 + y^2 = 1 and y = x^3 from (1, 1), against the root of x^2 + x^6 = 1."""
-
-    def residual(x: Array) -> Array:
-        return np.array([x @ x - 1, x[1] - x[0] ** 3]) * scales
-
-    def gradients(x: Array) -> Array:
-        return np.array([2 * x, [-3 * x[0] ** 2, 1]]) * np.array(scales)[:, None]
-
-    found, converged = root(residual, gradients, [1.0, 1.0])
-    roots = np.roots([1, 0, 0, 0, 1, 0, -1])
-    x = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real[0]
-    assert converged
-    # The eigenvalues of the companion matrix are good to some roundings.
-    np.testing.assert_allclose(found, [x, x**3], rtol=1e-13)
-
-
 def test_a_missing_root_is_reported():
     """x^2 + 1; and a double root, which is found, but is not regular."""
     _, converged = root(lambda x: x**2 + 1, lambda x: np.array([2 * x]), [0.7])

@@ -9,8 +9,7 @@ import numpy as np
 
 from referee.derive import balance, exact, frames
 from referee.description import Mechanism, force_names
-from referee.engines import ours
-from referee.reference import MOTIONS, STATES, Lines, load
+from referee.reference import STATES, Lines, load
 from referee.spatial import MECHANISMS
 
 ENGINES = ("ours", "drake_joints", "mujoco_engine", "pinocchio_engine")
@@ -26,8 +25,6 @@ constraint forces of the mechanism, in the size of the largest one, rounded down
 hold 15 or 16.
 What each engine solves, at the best settings found:
 """
-
-MOVED = "least digits of forces, positions and rates"
 
 Cell = float | str
 """The correct digits of an engine's forces, 0 to 16, or why it cannot tell."""
@@ -83,14 +80,6 @@ def compare_state(engine: ModuleType, mechanism: Mechanism, lines: Lines) -> Cel
     return correct_digits(found, wanted_forces(mechanism, lines))
 
 
-def compare_motion(mechanism: Mechanism, start: Lines, end: Lines) -> float:
-    """The least of our digits of forces, q and v after the motion."""
-    found = ours.after(mechanism, *state_of(mechanism, start))
-    parts = [(stacked(mechanism, found), wanted_forces(mechanism, end))]
-    parts += zip((found["q"], found["v"]), state_of(mechanism, end), strict=True)
-    return min(correct_digits(*part) for part in parts)
-
-
 def table(title: str, heads: Sequence[str], cells: dict[str, dict[str, Cell]]) -> str:
     """One table of digits, and why there is a '-', in Markdown."""
     rows = [[title, *heads], ["---"] * (len(heads) + 1)]
@@ -111,20 +100,15 @@ def main(names: Sequence[str]) -> None:
     if unknown := [name for name in names if name not in MECHANISMS]:
         raise SystemExit(f"no mechanism {', '.join(unknown)}; there are {', '.join(MECHANISMS)}")
     engines, missing = find_engines(ENGINES)
-    start, end = load(STATES), load(MOTIONS)
-    states, motions = {}, {}
+    lines, states = load(STATES), {}
     for name in names or MECHANISMS:
         mechanism = MECHANISMS[name]
-        states[name] = {e.NAME: compare_state(e, mechanism, start) for e in engines}
-        if name in end:
-            digits = compare_motion(mechanism, start, end)
-            motions[f"{name}, {mechanism.duration:g} s"] = {MOVED: digits}
+        states[name] = {e.NAME: compare_state(e, mechanism, lines) for e in engines}
         print(name, "is compared", flush=True)
     notes = [f"- **{engine.NAME}**: {engine.NOTE}." for engine in engines]
     heads = [engine.NAME for engine in engines]
     found = "## At the stated state\n\n" + table("mechanism", heads, states)
-    after = "## drake_dae after a motion\n\n" + table("mechanism, s", [MOVED], motions)
-    text = "\n".join([HEAD, *notes, *(f"- {sentence}" for sentence in missing), "", found, after])
+    text = "\n".join([HEAD, *notes, *(f"- {sentence}" for sentence in missing), "", found])
     print("\n" + text)
     if not names:
         Path(__file__).with_name("table.md").write_text(text)

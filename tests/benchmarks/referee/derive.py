@@ -15,7 +15,6 @@ Independent of drake_dae and of any engine: arrays of mpmath's numbers alone. In
    and the forces f. With sliding friction, G has the friction beside the normal force.
 5. If rows are redundant, only G f is determined. Of all f with this sum the one with the least sum
    of squares (in N and N m) is stated: f = G^T y.
-6. After a motion: v_free' and q' are integrated in the fewest coordinates, see `reference.py`.
 """
 
 from collections.abc import Sequence
@@ -292,10 +291,10 @@ class State:
     forces: dict[str, object]
 
 
-def state(mechanism: Mechanism, q: Array | None = None, rates: Array | None = None) -> State:
-    """All that is asked at closed positions with rates of the free joints; those stated if None."""
+def state(mechanism: Mechanism) -> State:
+    """All that is asked at the closed positions, with the stated rates of the free joints."""
     size, free = mechanism.size, list(mechanism.free)
-    q = closed(mechanism, exact(mechanism.q)) if q is None else q
+    q = closed(mechanism, exact(mechanism.q))
     rows = all_rows(mechanism, frames(mechanism, q, zeros(size)), q)
     J = np.array([row.gradient for row in rows])
     bound = [i for i in range(size) if i not in free]
@@ -312,8 +311,7 @@ def state(mechanism: Mechanism, q: Array | None = None, rates: Array | None = No
 
     units = [exact(np.arange(size) == i) for i in free]
     T = np.array([completed(unit, zeros(len(rows))) for unit in units])
-    if rates is None:
-        rates = exact([mechanism.v.get(i, 0.0) for i in free])
+    rates = exact([mechanism.v.get(i, 0.0) for i in free])
     v = completed(zeros(size), -np.array([row.drive for row in rows])) + rates @ T
     bodies = frames(mechanism, q, v)
     rows = all_rows(mechanism, bodies, q)

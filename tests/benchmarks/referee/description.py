@@ -85,7 +85,7 @@ class Mechanism:
     Each body stands after its parent. Of `q` the positions of `free` joints are exact, the others
     guesses from which Newton's method starts; `v` has the rates of free joints that are not zero.
     The free joints determine all others. `torques` act in joints. If forces are redundant, `split`
-    says how they are split. After `duration`, if it is not zero, the forces are compared again.
+    says how they are split.
     """
 
     name: str
@@ -98,7 +98,6 @@ class Mechanism:
     torques: Mapping[int, float] = field(default_factory=dict)
     springs: tuple[Spring, ...] = ()
     split: str = ""
-    duration: float = 0.0
 
     @property
     def size(self) -> int:

@@ -25,7 +25,6 @@ PENDULUM = Mechanism(
     v={2: 2.5},
     free=(2,),
     gravity=DOWN,
-    duration=1.0,
 )
 
 TWO_RODS = Mechanism(
@@ -39,7 +38,6 @@ TWO_RODS = Mechanism(
     v={2: 1.5, 5: -2.0},
     free=(2, 5),
     gravity=DOWN,
-    duration=0.5,
 )
 
 FOUR_BAR = Mechanism(
@@ -55,7 +53,6 @@ FOUR_BAR = Mechanism(
     free=(0,),
     gravity=DOWN,
     torques={0: 0.5},
-    duration=0.5,
 )
 
 # Andrews' squeezer: the numbers of the Test Set for IVP Solvers; without gravity.
@@ -98,7 +95,6 @@ SQUEEZER = Mechanism(
     gravity=(0.0, 0.0, 0.0),
     torques={0: 0.033},
     springs=(Spring("world", C, "K3", (0.02, -0.018, 0.0), 4530.0, 0.07785),),
-    duration=0.01,
 )  # fmt: skip
 
 
@@ -113,7 +109,6 @@ SLIDING_ROD = Mechanism(
     v={0: 1.5, 2: -0.7},
     free=(0, 2),
     gravity=DOWN,
-    duration=0.04,
 )  # fmt: skip
 
 # The car axis of the Test Set for IVP Solvers, with other numbers: a road that moves up and down

@@ -29,7 +29,6 @@ TOP = Mechanism(
     q=(0.0, 0.0, 0.0, 0.3, 0.5, 0.1),
     v={3: 1.0, 4: 0.4, 5: 60.0},
     free=(3, 4, 5),
-    duration=0.1,
 )
 
 # Rods of 1 m and 1 kg along edges of a cube (IFToMM's benchmark), where q = 0; one edge is fixed.
@@ -70,7 +69,6 @@ BRICARD = Mechanism(
     v={0: 1.2},
     free=(0,),
     split=LEAST,
-    duration=0.1,
 )  # fmt: skip
 
 ARM_AXES = (Z, Y, Y, X, Y, X)
@@ -169,7 +167,6 @@ GEARS = Mechanism(
     v={0: 9.0},
     free=(0,),
     torques={0: 0.4, 3: -0.6},
-    duration=0.2,
 )  # fmt: skip
 
 MECHANISMS = {

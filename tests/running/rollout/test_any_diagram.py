@@ -2,9 +2,11 @@
 
 import shutil
 import subprocess
+from functools import partial
 
 import numpy as np
 import pytest
+from arms import fixed_step
 from blocks_of_users import Counter_, Guarded
 from by_hand import OUTPUTS, wired
 from pydrake.common import RandomDistribution, RandomGenerator
@@ -22,7 +24,6 @@ from pydrake.systems.primitives import (
     RandomSource,
     Saturation,
     Sine,
-    WrapToSystem,
     ZeroOrderHold,
 )
 from runs import both
@@ -33,11 +34,7 @@ from drake_dae.errors import ModelError
 from drake_dae.running import export_loop, start_values
 from drake_dae.running.rollout_program import events_within, program_of
 
-
-def fixed(step=1e-3):
-    return SimulatorConfig(
-        integration_scheme="runge_kutta3", max_step_size=step, use_error_control=False
-    )
+fixed = partial(fixed_step, scheme="runge_kutta3")
 
 
 @pytest.mark.slow
@@ -128,17 +125,6 @@ def test_random_diagrams_roll_out(seed):
         np.testing.assert_allclose(
             found.record[f"out {number}"][:-1, 0], log.data()[0, rows], rtol=1e-11, atol=1e-11
         )
-
-
-def test_what_drake_alone_can_run_is_named():
-    builder = DiagramBuilder()
-    sine = builder.AddSystem(Sine(1.0, 2.0, 0.0, 1))
-    wrap = builder.AddNamedSystem("my own block", WrapToSystem(1))
-    builder.Connect(sine.get_output_port(0), wrap.get_input_port())
-    builder.ExportOutput(wrap.get_output_port(), "wrapped")
-    diagram = builder.Build()
-    with pytest.raises(ModelError, match="'my own block'"):
-        start_values(diagram, diagram.CreateDefaultContext())
 
 
 @both

@@ -68,21 +68,6 @@ def test_the_record_is_that_of_simulate(name, compiled):
         assert_allclose(record[signal][own], expected[signal][rows], rtol=0, atol=1e-9 * size)
 
 
-@pytest.mark.slow
-def test_many_starts_are_each_alone():
-    found = chosen("a law with observer and integrals", 0.02)
-    loop, context = build_scenario(found)
-    start, parameters = start_values(loop, context)
-    other = start.copy()
-    other[0] += 1e-3
-    times = rollout_times(found, loop.plant.time_step)
-    both = rollout(loop, [start, other, start], parameters, times)
-    (alone,) = rollout(loop, other, parameters, times)
-    assert_allclose(both[1].record["state"], alone.record["state"], rtol=0, atol=0)
-    assert_allclose(both[0].record["state"], both[2].record["state"], rtol=0, atol=0)
-    assert np.abs(both[1].record["state"] - both[0].record["state"]).max() > 1e-4
-
-
 def test_any_diagram_with_such_a_plant_rolls_out_and_is_not_exported(tmp_path):
     found = chosen("a law that acts late, at another period", 0.02)
     loop, context = build_scenario(found)

@@ -9,7 +9,7 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
-from runs import scenario, some
+from runs import close_records, scenario, some
 
 from drake_dae import build_scenario, rollout
 from drake_dae.blocks import machine
@@ -62,11 +62,7 @@ def assert_same(ours, theirs, tolerance, slack=0):
     for one, other in zip(ours, theirs, strict=True):
         assert one.failure is None
         assert abs(one.steps - other.steps) <= slack
-        for name, recorded in other.record.signals.items():
-            scale = max(1.0, np.abs(recorded.values).max(initial=0.0))
-            np.testing.assert_allclose(
-                one.record[name], recorded.values, rtol=0.0, atol=tolerance * scale
-            )
+        close_records(one.record, other.record, tolerance)
 
 
 @pytest.mark.slow

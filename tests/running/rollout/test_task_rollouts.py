@@ -1,11 +1,10 @@
 """Rollouts of tasks against Drake's Simulator."""
 
-import numpy as np
 import pytest
 from golden.cases import FIXTURE
 from polishing import CLIMB, push, started, task_loop
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
-from runs import mostly_compiled, some
+from runs import close_records, mostly_compiled, some
 
 from drake_dae import (
     Approach,
@@ -76,10 +75,7 @@ TASKS = {
 def assert_same_records(found, wanted, tolerance):
     assert list(found.signals) == list(wanted.signals)
     count = min(found.time.size, wanted.time.size)
-    for name, recorded in wanted.signals.items():
-        scale = max(1.0, np.max(np.abs(recorded.values), initial=0.0))
-        off = np.abs(found[name][:count] - recorded.values[:count]).max(axis=1) / scale
-        assert off.max() < tolerance, name
+    close_records(found, wanted, tolerance, slice(count))
 
 
 @pytest.mark.slow

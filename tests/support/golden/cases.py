@@ -78,14 +78,6 @@ SEEN = (
     "plant.parameters={wall.position: [0.701, 0, 0], wall.rpy: [0, 0.02, -0.01]}",
 )
 
-SPRINGS = (
-    "sampling=null",
-    "law.integral=[]",
-    "estimator=null",
-    "sensors.force=null",
-    "plant=!CompliantContact {time_step: 0, stiffness: 1.0e5, friction: 0.1}",
-)
-
 CASES = {
     **{
         name: Case(name, step=0.5e-3 if name == "biped" else 1e-3, is_slow=name not in QUICK)

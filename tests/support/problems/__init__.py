@@ -10,7 +10,6 @@ from collections.abc import Callable
 from functools import cache
 
 from problems.closed_loop import closed_loop_outputs, integrated, reference_at, wanted_outputs
-from problems.hidden import Hidden, hidden_normal_form
 from problems.made_up import (
     bead,
     changed,

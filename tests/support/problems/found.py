@@ -28,4 +28,4 @@ def findings(analysis: Analysis) -> list[Finding]:
     return [assumption.finding for assumption in analysis.assumptions]
 
 
-YES, NO, OPEN = Finding.SATISFIED, Finding.VIOLATED, Finding.NOT_EXAMINED
+YES, NO = Finding.SATISFIED, Finding.VIOLATED

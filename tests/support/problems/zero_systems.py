@@ -5,13 +5,9 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae import DaeSystem, ZeroDynamics
+from drake_dae.dae import DaeSystem
 
 Array = np.ndarray
-
-
-def zero_dynamics(system: DaeSystem) -> ZeroDynamics:
-    return ZeroDynamics(system)
 
 
 def derivatives(function: Callable[[ca.SX], list], degrees: tuple[int, ...]):

@@ -4,14 +4,13 @@ from functools import cache
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
 from referee.description import Closure, Mechanism
 from referee.tree import add_tree, controls, frame_at
 
 NAME = "drake_dae"
-NOTE = "ideal constraints; motions by runge_kutta5 with error control at 1e-12"
+NOTE = "ideal constraints"
 STILL = 1e-12
 """The speed of regularized friction in m/s; at 1 m/s it takes 1e-24 off Coulomb's."""
 
@@ -65,18 +64,6 @@ def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.n
     plant = dd.RobotPlant(model_of(mechanism))
     context = context_of(plant, mechanism, q, v)
     return read(mechanism, plant, context)
-
-
-def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The positions, rates and forces after the motion from there."""
-    plant = dd.RobotPlant(model_of(mechanism))
-    context = context_of(plant, mechanism, q, v)
-    config = SimulatorConfig(
-        integration_scheme="runge_kutta5", accuracy=1e-12, use_error_control=True
-    )
-    dd.simulate(plant, context, mechanism.duration, config)
-    state = plant.state(context)
-    return {"q": state[: len(q)], "v": state[len(q) :], **read(mechanism, plant, context)}
 
 
 def context_of(plant: dd.RobotPlant, mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> object:
