@@ -14,7 +14,7 @@ from runs import some
 
 import drake_dae as dd
 from drake_dae import poles
-from drake_dae.errors import ModelError, NonFiniteError, SingularityError
+from drake_dae.errors import ModelError, NonFiniteError
 from drake_dae.systems import TrajectoryReference
 
 GRADIENT = 3e-9
@@ -217,25 +217,6 @@ def test_closed_loops_have_the_assigned_poles(name, kind):
     loop, context = resting_loop(model, structure, poles(assigned))
     # Round-off of A, whose largest entries belong to stiff joints and small inductances.
     assert_poles(loop, context, np.concatenate([*assigned.values()]), 2, 2e-9)
-
-
-def test_failures_name_time_and_state():
-    found = arm("two_link")
-    controller = dd.TrackingController(law("two_link")).ToAutoDiffXd()
-    context = controller.CreateDefaultContext()
-    context.SetTime(1.5)
-    controller.GetInputPort("estimated_state").FixValue(context, np.zeros(4))
-    controller.GetInputPort("reference").FixValue(context, np.zeros(4))
-    with pytest.raises(SingularityError, match=r"wall\.force") as info:
-        controller.GetOutputPort("control").Eval(context)
-    np.testing.assert_array_equal(info.value.state, np.zeros(4))
-
-    plant = dd.RobotPlant(found.model, structure=found.structure).ToAutoDiffXd()
-    context = plant.CreateDefaultContext()
-    plant.GetInputPort("control").FixValue(context, [0.0, np.nan])
-    with pytest.raises(NonFiniteError, match="joint2_motor") as info:
-        plant.EvalTimeDerivatives(context)
-    assert info.value.state.shape == (4,)
 
 
 def test_a_function_without_derivative_is_named():

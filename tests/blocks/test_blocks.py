@@ -24,9 +24,6 @@ from drake_dae import Block, TracedSystem, build_scenario, compile_diagram
 from drake_dae.blocks import Held, Requirement
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 
-# Round-off of a handful of operations.
-EXACT = 1e-13
-
 
 def pendulum() -> Block:
     """x'' = -g sin(x) - d x' + u, with a counter of samples and the last sample of x."""
@@ -93,7 +90,7 @@ def test_it_converts_to_expressions():
     context.SetContinuousState([Expression(angle), Expression(rate)])
     change = system.EvalTimeDerivatives(context).CopyToVector()[1]
     assert change.Evaluate({angle: 0.4, rate: -0.2}) == pytest.approx(
-        -9.81 * np.sin(0.4) + 0.02, abs=EXACT
+        -9.81 * np.sin(0.4) + 0.02, abs=1e-13
     )
 
 

@@ -11,7 +11,7 @@ from problems import PROBLEMS, hanging_pendulum
 from runs import some
 from two_arms import two_arms
 
-from drake_dae.dae import DaeSystem, NormalForm, Structure, find_structure, linearize
+from drake_dae.dae import DaeSystem, NormalForm, find_structure, linearize
 from drake_dae.errors import InconsistentStateError
 
 ROBOTS = {
@@ -30,14 +30,6 @@ ROBOTS = {
 def form(name: str) -> NormalForm:
     structure = ROBOTS[name]() if name in ROBOTS else find_structure(PROBLEMS[name]().system)
     return NormalForm(structure.system, structure=structure)
-
-
-def chain_ends(structure: Structure) -> tuple[np.ndarray, np.ndarray]:
-    """Where the chains of constraints and of outputs end in (y, zeta, xi)."""
-    ends = np.cumsum([*structure.constraint_degrees, *structure.output_degrees]) - 1
-    m = len(structure.constraint_degrees)
-    dynamic = np.flatnonzero(structure.output_degrees)
-    return ends[:m], ends[m:][dynamic]
 
 
 @pytest.mark.slow
@@ -84,7 +76,10 @@ def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
         [ca.densify(e) for e in (system.f, system.g, system.h)],
     )
     random = np.random.default_rng(2)
-    constraint_ends, output_ends = chain_ends(normal_form.structure)
+    # Where the chains of constraints and of outputs end in (y, zeta, xi).
+    ends = np.cumsum([*problem.constraint_degrees, *problem.output_degrees]) - 1
+    m, dynamic = len(problem.constraint_degrees), np.flatnonzero(problem.output_degrees)
+    constraint_ends, output_ends = ends[:m], ends[m:][dynamic]
     for _ in range(3):
         x, u = problem.consistent(random), random.standard_normal(system.num_controls)
         f, g, h = (np.array(e) for e in fields(x, system.parameter_values))
@@ -95,7 +90,7 @@ def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
         expected = np.roll(coordinates, -1)
         expected[constraint_ends] = 0.0
         highest = known.drift + known.control_matrix @ u
-        expected[output_ends] = highest[np.flatnonzero(problem.output_degrees)]
+        expected[output_ends] = highest[dynamic]
         first_xi = system.num_states - problem.zero_dynamics
         scale = max(1.0, np.abs(moving).max())
         np.testing.assert_allclose(

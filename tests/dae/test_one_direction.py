@@ -76,14 +76,8 @@ CASES = [
 ]
 
 
-MARKED = list(enumerate(CASES))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("direction", "rates"),
-    some([pytest.param(*case, marks=[pytest.mark.thorough] * (i in (1, 2))) for i, case in MARKED]),
-)
+@pytest.mark.parametrize(("direction", "rates"), some(CASES, of=4))
 def test_deviations_are_those_of_a_loop_with_noise(direction, rates):
     """100 s, in which errors are correlated for some 0.2 s: 500 of them tell 3 per cent."""
     noise = replace(NOISE, velocity=0.0) if rates.state_rate else NOISE

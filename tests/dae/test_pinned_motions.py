@@ -3,24 +3,13 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import PROBLEMS, Problem, reference_at, wanted_outputs
+from problems import PROBLEMS, reference_at, wanted_outputs
 from problems.zero_systems import GRAVITY, Array, cart_pendulum, derivatives, free_arm, internal
 from runs import some
 from scipy.integrate import solve_ivp
 
-from drake_dae.dae import DaeSystem, EndCause, PinnedMotion, ZeroDynamics
+from drake_dae.dae import DaeSystem, EndCause, ZeroDynamics
 from drake_dae.errors import NonFiniteError
-
-
-def following(problem: Problem, count: int = 13) -> tuple[ZeroDynamics, Array, PinnedMotion]:
-    """A problem's reference from a random start, without failure."""
-    times = np.linspace(0.0, problem.horizon, count)
-    dynamics = ZeroDynamics(problem.system)
-    start = problem.consistent(np.random.default_rng(3))
-    motion = dynamics.motion(lambda t: reference_at(problem, t), times, start)
-    assert motion.ending is None
-    np.testing.assert_array_equal(motion.times, times)
-    return dynamics, times, motion
 
 
 @pytest.mark.slow
@@ -28,8 +17,11 @@ def following(problem: Problem, count: int = 13) -> tuple[ZeroDynamics, Array, P
 @pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
 def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
     """By the closed forms of the problem: k and its derivatives, z = l + m (alpha + beta u)."""
-    _, times, motion = following(problem)
-    system = problem.system
+    system, times = problem.system, np.linspace(0.0, problem.horizon, 13)
+    start = problem.consistent(np.random.default_rng(3))
+    motion = ZeroDynamics(system).motion(lambda t: reference_at(problem, t), times, start)
+    assert motion.ending is None
+    np.testing.assert_array_equal(motion.times, times)
     numbers = ca.Function(
         "lm", [system.state, system.parameter_symbol], [ca.densify(system.l), ca.densify(system.m)]
     )

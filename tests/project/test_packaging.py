@@ -46,7 +46,6 @@ def wheel(dist: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
 def test_sdist_holds_what_is_tracked_and_what_its_readers_are_sent_to(dist: Path) -> None:
     """The book, the tests and the Makefile work in it; the workplace of this checkout stays out."""
     (path,) = dist.glob("*.tar.gz")
@@ -63,7 +62,6 @@ def test_sdist_holds_what_is_tracked_and_what_its_readers_are_sent_to(dist: Path
     assert names == expected | {".ci/readme.py", "LICENSE", "Makefile", "PKG-INFO", ".gitignore"}
 
 
-@pytest.mark.slow
 def test_wheel_from_sdist_holds_every_file_of_the_package(wheel: Path) -> None:
     expected = {
         Path(folder, file).relative_to(ROOT).as_posix()
@@ -86,7 +84,6 @@ def test_links_lead_to_an_address_where_one_is_given() -> None:
     assert readme(text).startswith("seen (`a/b.gif`) one (`c.md`) [two](https://d.org)")
 
 
-@pytest.mark.slow
 def test_installed_wheel_simulates_a_shipped_scenario(wheel: Path, tmp_path: Path) -> None:
     venv.create(tmp_path / "venv", with_pip=False, symlinks=True)
     python = tmp_path / "venv" / "bin" / "python"

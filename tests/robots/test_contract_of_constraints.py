@@ -114,18 +114,14 @@ def turning_in_a_plane_at(place, base):
     return turning(place, base, -0.7, planar=True, motor=True, effort_limit=5.0)
 
 
-def sliding(place, base, **options):
+def sliding_at(place, base):
     """The tip 0.3 m along the y axis of such a frame."""
     own = RigidTransform(RollPitchYaw(-0.4, 0.5, 0.9), POINT)
     joint = base.inverse() @ place @ own @ RigidTransform([0.0, -0.3, 0.0])
     point, rpy = joint.translation(), RollPitchYaw(joint.rotation()).vector()
-    return PrismaticLoopJoint(
-        "base", "tip", "y", tuple(point), tuple(rpy), POINT, (-0.4, 0.5, 0.9), **options
-    )
-
-
-def sliding_at(place, base):
-    return sliding(place, base, damping=3.0, motor=True, lower=0.0, upper=0.5, velocity_limit=2.0)
+    ends = (tuple(point), tuple(rpy), POINT, (-0.4, 0.5, 0.9))
+    options = {"motor": True, "lower": 0.0, "upper": 0.5, "velocity_limit": 2.0}
+    return PrismaticLoopJoint("base", "tip", "y", *ends, damping=3.0, **options)
 
 
 def rod_at(place, base):

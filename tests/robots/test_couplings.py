@@ -23,6 +23,7 @@ from drake_dae import (
     Plane,
     RobotModel,
     RobotPlant,
+    RollingWheel,
     WeldedFrames,
     find_structure,
 )
@@ -178,6 +179,7 @@ def test_gears_carry_the_moment_of_the_textbook():
         (lambda: JointCoupler("a", "b", unit="deg"), "'deg'"),
         (lambda: AxisNormalToSurface("a", Plane((0, 0, 0), (0, 0, 1)), (0.0, 0.0, 0.0)), "axis"),
         (lambda: FixedDistance("a", (0, 0, 0), "b", (0, 0, 0), 0.0), r"'rod\.length'"),
+        (lambda: RollingWheel("a", 0.0), r"'wheel\.radius'"),
     ],
 )
 def test_what_makes_no_sense_is_refused(make, words):

@@ -4,7 +4,6 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-import pytest
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -17,7 +16,6 @@ from pydrake.multibody.tree import (
 from test_contract_of_constraints import robot
 
 from drake_dae import PointCoordinates, RobotModel, RobotPlant, RollingWheel, find_structure
-from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 
 # A robot with two driven wheels, on a planar joint: two wheels roll, one of them holds the side.
@@ -159,8 +157,3 @@ def test_rates_are_velocities_of_the_points_that_touch():
         slip = velocity(contact)
         expected = [heading @ slip, np.cross(up, heading) @ slip]
         np.testing.assert_allclose(found[0], expected, atol=1e-12)
-
-
-def test_a_wheel_without_radius_is_refused():
-    with pytest.raises(ModelError, match=r"'wheel\.radius'"):
-        RollingWheel("a", 0.0)
