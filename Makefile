@@ -26,6 +26,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 # The tables that `make table` makes: each with its own environment, and its program.
 TABLE_friction := examples/unknown_friction
 TABLE_referee := -m referee
+TABLE_robots := tests/campaign/real_robots.py
 TABLE_equations := tests/support/equations.py
 TABLE_peers := tests/benchmarks/contact_peers.py
 
@@ -38,10 +39,11 @@ help:
 	@echo 'make check       lint, types and the quick tests: the daily round, some four minutes'
 	@echo 'make test        lint, types and tests: a quarter of an hour on two cores'
 	@echo 'make benchmark   speed, with ratios, beside peers that it installs; some 10 minutes'
-	@echo 'make campaign    bad inputs, random robots, the dearest tests: hours'
-	@echo 'make table NAME=friction|referee|equations|peers [ARGS=...]'
+	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: hours'
+	@echo 'make table NAME=friction|referee|robots|equations|peers [ARGS=...]'
 	@echo '    friction     contact whose friction the law does not know: some minutes'
 	@echo '    referee      constraint forces of four engines and the right ones: some minutes'
+	@echo '    robots       robots of packages, from drake-dae new to a run: an hour'
 	@echo '    equations    from each equation of the paper to its line and its test'
 	@echo '    peers        our law beside others on the same contact: half an hour'
 	@echo 'make pictures    film the demo and a task, into $(PICTURES)/'
@@ -71,6 +73,7 @@ benchmark: $(VENV)/installed-benchmark
 
 campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/run.py --inputs 1600 --files 2000 --robots 520 --seed $(SEED)
+	$(BIN)/python tests/campaign/memory.py
 	$(PYTEST) -m thorough
 
 # Robots are those of example-robot-data, and of pybullet_data and robosuite where these are
