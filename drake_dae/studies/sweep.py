@@ -77,8 +77,8 @@ def sweep(
     exceeds the time limit, is lost alone, and the next call repeats it. Keys and values of up to
     twenty variations are checked before the first run, which has to be a valid one.
 
-    Runs that differ only in start, duration, integrator, plant.parameters, seeds, or gains that
-    couple no outputs, share one closed loop in each process.
+    Runs that differ only in start (positions where gains are given), duration, integrator,
+    plant.parameters, seeds, or gains that couple no outputs, share one closed loop in each process.
 
     Args:
         scenario: A scenario from `load_scenario`.
@@ -294,8 +294,9 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
     The other values are set in a context, so that runs with the same part share one loop: start,
     duration and integrator, parameters of the plant, gains that couple no outputs, seeds.
     """
-    plant, is_advised = base.plant, base.is_advised  # Such gains are computed from the plant.
-    patterns = [*_OF_A_RUN, *(rf"start\.positions\.{re.escape(q)}" for q in base.start.positions)]
+    plant, is_advised = base.plant, base.is_advised  # Such gains are computed from plant and start.
+    places = base.start.positions if not is_advised else ()
+    patterns = [*_OF_A_RUN, *(rf"start\.positions\.{re.escape(q)}" for q in places)]
     numbers = [name for name in plant.in_context if not is_advised or name == "friction"]
     patterns += [rf"plant\.{re.escape(name)}" for name in numbers]
     if not plant.carries:

@@ -9,6 +9,7 @@ from drake_dae.studies.study import Outcome
 from drake_dae.studies.sweep import Runner, structure_of
 
 SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
+COMPUTED = "plant=!CompliantContact {time_step: 0.001}", "sampling={period: 0.001}", "law.gains="
 
 
 LOADED = (
@@ -95,15 +96,9 @@ def test_runs_that_share_a_loop_equal_runs_alone(changes):
         ((), {"references.tool.z.offset": 0.2}),
         ((), {"constraints.0.surface.point": [1.25, 0.0, 0.0]}),
         ((), {"law.gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}}),
-        # Gains are computed for the stiffness.
-        (
-            (
-                "plant=!CompliantContact {time_step: 0.001}",
-                "sampling={period: 0.001}",
-                "law.gains=",
-            ),
-            {"plant.stiffness": 1e4},
-        ),
+        # Gains are computed for the stiffness, and for the robot where it starts.
+        (COMPUTED, {"plant.stiffness": 1e4}),
+        (COMPUTED, {"start.positions.joint1": 1.1}),
     ],
 )
 def test_what_is_built_in_has_a_loop_of_its_own(settings, variation):
