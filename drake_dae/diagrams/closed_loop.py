@@ -35,7 +35,7 @@ from drake_dae.diagrams.parts import (
     misfits,
 )
 from drake_dae.diagrams.parts import encoder_seed as seed_of_encoders
-from drake_dae.diagrams.record import Record, Recorded
+from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import DrakeDaeError, ModelError, WiringError
 from drake_dae.references import Reference, references_by_name
 from drake_dae.scene.view import add_live_view
@@ -138,7 +138,7 @@ class ClosedLoop:
         values = {name: recorded.values for name, recorded in record.signals.items()}
         derived = self.controller.derived(values)
         added = {name: Recorded(v, signals) for name, (v, signals) in derived.items()}
-        return Record(record.time, {**record.signals, **added})
+        return computed_record(record.time, {**record.signals, **added})
 
     @checked(WiringError)
     def plant_parameters(self, record: Record, context: Context) -> FloatArray:

@@ -50,6 +50,11 @@ class Record:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "time", numbers("the times of a record", self.time))
+        own = {
+            name: Recorded(numbers(f"the values of '{name}' in a record", r.values), r.signals)
+            for name, r in self.signals.items()
+        }
+        object.__setattr__(self, "signals", own)
         if self.time.ndim != 1 or np.any(np.diff(self.time) <= 0.0):
             raise ModelError("the times of a record must be strictly increasing numbers")
         for name, recorded in self.signals.items():
@@ -114,7 +119,7 @@ class Record:
         last = np.append(np.diff(time) > 0.0, True)[: time.size]
         columns = np.split(rows[last], stops[1:-1], axis=1)
         pairs = zip(signals.items(), columns, strict=True)
-        found = {n: Recorded(np.ascontiguousarray(v), tuple(each)) for (n, each), v in pairs}
+        found = {n: Recorded(v, tuple(each)) for (n, each), v in pairs}
         return cls(time[last], found)
 
     @checked(ModelError)
@@ -185,6 +190,13 @@ class Record:
         except Exception as error:  # zip files, NumPy's headers and JSON raise many kinds.
             text = getattr(error, "strerror", None) or f"{error}; it may be cut off or damaged"
             raise ModelError(f"{path} is not a record of a run: {text}") from None
+
+
+def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> Record:
+    """A record that the library itself has computed, made without checks and copies."""
+    record = object.__new__(Record)
+    vars(record).update(time=time, signals=signals, about={})
+    return record
 
 
 RecordAfter = Callable[[float | None], Record]

@@ -17,7 +17,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references.formulas import ConstantReference
-from drake_dae.references.reference import Reference
+from drake_dae.references.reference import Reference, expression_of
 
 
 @checked(ReferenceSignalError)
@@ -47,7 +47,7 @@ class ReferenceRows(Reference):
         degree_of = dict(zip(self.rows, degrees, strict=True))
         needed = [degree_of.get(row, 0) for row in range(self.reference.size)]
         starts = np.cumsum([0, *(degree + 1 for degree in needed)]).tolist()
-        value = self.reference.expression(needed, time)
+        value = expression_of(self.reference, needed, time)
         return ca.vertcat(*(value[starts[row] : starts[row + 1]] for row in self.rows))
 
 
@@ -71,7 +71,7 @@ def assign(
         raise ReferenceSignalError(
             f"{reference.size} value(s) for {len(places)} output(s): {listed}"
         )
-    reference.expression([degrees[i] for i in places], ca.SX.sym("t"))
+    expression_of(reference, [degrees[i] for i in places], ca.SX.sym("t"))
     return Assignment(name, reference, places)
 
 

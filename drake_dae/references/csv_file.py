@@ -20,6 +20,9 @@ from drake_dae.references.splines import (
     uniform_spline,
 )
 
+MOST = 1e15
+"""Larger numbers are refused: a double has no useful digits left."""
+
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
@@ -127,14 +130,20 @@ def _read(file: Path, names: Sequence[str]) -> FloatArray:
     for name in names:
         if name not in header:
             raise ReferenceSignalError(f"'{file}': {unknown_name('column', name, header)}")
+        if header.count(name) > 1:
+            raise ReferenceSignalError(
+                f"'{file}': {header.count(name)} columns have the name '{name}'; each column that "
+                "is read needs its own"
+            )
     values = np.empty((len(rows), len(names)))
     for i, row in enumerate(rows):
         cells = dict(zip(header, row, strict=False))
         for j, name in enumerate(names):
             value = number_in(cell := cells.get(name, ""))
-            if value is None:
+            if value is None or abs(value) > MOST:
+                expected = "a number" if value is None else f"a number of at most {MOST:g}"
                 raise ReferenceSignalError(
-                    f"'{file}', row {i + 2}, {name}: expected a number, got '{cell[:40]}'"
+                    f"'{file}', row {i + 2}, {name}: expected {expected}, got '{cell[:40]}'"
                 )
             values[i, j] = value
     if len(values) < 2:

@@ -18,7 +18,7 @@ from drake_dae.references.reference import (
     check_order,
     common_period,
 )
-from drake_dae.trace.expressions import find_flaw, result_of
+from drake_dae.trace.expressions import result_of
 
 
 @checked(ReferenceSignalError)
@@ -131,9 +131,8 @@ class PointToPointReference(FormulaReference):
         first, last = np.asarray(self.start), np.asarray(self.end)
         return ca.vertcat(*[a + (b - a) * blend for a, b in zip(first, last, strict=True)])
 
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+    def check_smoothness(self, degrees: Sequence[int]) -> None:
         check_continuity(self, self.order, degrees)
-        return super().expression(degrees, time)
 
 
 @checked(ReferenceSignalError)
@@ -165,17 +164,6 @@ class ExpressionReference(FormulaReference):
     @property
     def size(self) -> int:
         return int(self.rows(ca.SX.sym("t")).numel())
-
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
-        rows = self.rows(symbol := ca.SX.sym("t"))
-        for i, degree in enumerate(degrees):
-            flaw = find_flaw(rows[i], symbol, ca.SX(0, 1), "the time")
-            if degree and flaw:
-                raise ReferenceSignalError(
-                    f"row {i} of the reference {flaw}. The law needs {degree} derivatives of it; a "
-                    "move from rest to rest is a PointToPointReference"
-                )
-        return super().expression(degrees, time)
 
     def rows(self, time: ca.SX) -> ca.SX:
         value = result_of("function", self.function, time, error=ReferenceSignalError)

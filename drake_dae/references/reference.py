@@ -8,8 +8,9 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, brief
 from drake_dae.errors import NonFiniteError, ReferenceSignalError
+from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -60,12 +61,26 @@ class FormulaReference(Reference):
         """Returns r(t), shape (size, 1)."""
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        self.check_smoothness(degrees)
         values = []
         for row, degree in zip(ca.vertsplit(self.rows(time)), degrees, strict=True):
             values.append(row)
             for _ in range(degree):
                 values.append(ca.jacobian(values[-1], time))
         return ca.vertcat(*values)
+
+    def check_smoothness(self, degrees: Sequence[int]) -> None:
+        """Raises ReferenceSignalError if a row has no derivatives up to its degree."""
+        time = ca.SX.sym("t")
+        rows = self.rows(time)
+        others = [symbol for symbol in ca.symvar(rows) if not ca.is_equal(symbol, time)]
+        for i, degree in enumerate(degrees):
+            flaw = find_flaw(rows[i], time, ca.vertcat(ca.SX(0, 1), *others), "the time")
+            if degree and flaw:
+                raise ReferenceSignalError(
+                    f"row {i} of the reference {flaw}. The law needs {degree} derivatives of it; a "
+                    "move from rest to rest is a PointToPointReference"
+                )
 
 
 def check_order(order: int, least: int, most: int) -> None:
@@ -95,13 +110,24 @@ def common_period(periods: Sequence[float | None]) -> float | None:
     return None
 
 
+def expression_of(reference: Reference, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+    """Returns the expression of a reference, of the right shape."""
+    rows, wanted = reference.expression(degrees, time), (sum(degrees) + len(degrees), 1)
+    if getattr(rows, "shape", None) != wanted:
+        raise ReferenceSignalError(
+            f"the expression of a {type(reference).__name__} must have shape {wanted}, all values "
+            f"for the degrees {list(degrees)}; it returns {brief(rows)}"
+        )
+    return rows
+
+
 def stacked_expression(
     references: Sequence[Reference], degrees: Sequence[int], time: ca.SX
 ) -> ca.SX:
     """Returns R(t) of references at a symbolic time, shape (sum (mu_i + 1), 1)."""
     ends = np.cumsum([0, *(reference.size for reference in references)])
     rows = [
-        reference.expression(degrees[first:last], time)
+        expression_of(reference, degrees[first:last], time)
         for reference, (first, last) in zip(references, pairwise(ends), strict=True)
     ]
     return ca.vertcat(ca.SX(0, 1), *rows)

@@ -15,7 +15,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, positive, show, vector
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
-from drake_dae.files import MESHES, read_mesh, read_text
+from drake_dae.files import MESHES, check_file, read_mesh, read_text
 from drake_dae.robots.surface import Pair, Surface, Vector, tangents
 
 CELLS, BEYOND = 16, 3  # Bells along the longer side, and beyond each edge, for a fit there.
@@ -190,6 +190,7 @@ def _bells(values: FloatArray, places: FloatArray, width: float) -> FloatArray:
 
 def _read_table(file: Path) -> FloatArray:
     """The heights in a .csv file, first row lowest."""
+    check_file(file, ModelError)
     try:
         if file.suffix.lower() != ".csv":
             raise ValueError("its name ends with neither")

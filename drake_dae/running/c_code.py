@@ -130,6 +130,8 @@ def identifiers(vectors: Vectors) -> dict[str, Sequence[Signal]]:
     for name, signals in vectors.items():
         word = re.sub(r"\W+", "_", name, flags=re.ASCII)
         word = f"v_{word}" if not word or word[0].isdigit() else word
+        while word in by_word:
+            word += "_"
         if signals:
             by_word[word] = signals
     return by_word

@@ -24,7 +24,7 @@ from drake_dae.blocks.stepping import RunProblem, StepFunctions
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.record import Record, Recorded
+from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError
 from drake_dae.running.merged_run import parameters_in, put_states, states_in
 from drake_dae.systems.ideal_plants import DaePlant
@@ -212,11 +212,13 @@ class RolloutProgram:
             states = np.repeat(states, count, axis=0)
         count = len(states)
         for what, given in (("rows of parameters", rows), ("seeds", seeds)):
-            if given is not None and len(given) != count and (what == "seeds" or len(given) > 1):
+            allowed = (count,) if what == "seeds" else (1, count)
+            if given is not None and len(given) not in allowed:
                 raise ModelError(f"{len(given)} {what} for {count} starts")
         # Without noise, or without seeds, it is the same in all runs.
-        different = [self.seeds(seed) for seed in seeds or ()] if self.sources else []
-        noise = np.array([self._noise(times[0], events, due, seed) for seed in different or [{}]])
+        different = [self.seeds(seed) for seed in seeds or ()]
+        different = different if different and self.sources else [{}]
+        noise = np.array([self._noise(times[0], events, due, seed) for seed in different])
         held = np.zeros((count, functions.sizes[2]))
         held[:, self.kept_places] = states[:, self.num_states :]
         held[:, self.drawn_places] = noise[:, 0]
@@ -229,14 +231,14 @@ class RolloutProgram:
 
     def seeds(self, seed: Seed | None) -> dict[str, int]:
         """Name of a source -> its seed in a run, of those that have one."""
+        for value in seed.values() if isinstance(seed, Mapping) else [seed or 0]:
+            if not 0 <= value < 2**32:
+                raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(value)}")
         named = {each: source.get_name() for each, source in self.sources.items()}
         if isinstance(seed, Mapping):
             found = {each: seed[name] for each, name in named.items() if name in seed}
         else:
             found = {} if seed is None else dict.fromkeys(named, seed)
-        for value in found.values():
-            if not 0 <= value < 2**32:
-                raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(value)}")
         shift = 0 if isinstance(seed, Mapping) else 2**31  # Sources have numbers of their own.
         places = {each: shift * k for k, each in enumerate(named)}
         return {each: (int(value) + places[each]) % 2**32 for each, value in found.items()}
@@ -302,7 +304,7 @@ class RolloutProgram:
         for name, entries in self.signals.items():
             start, stop = stop, stop + len(entries)
             signals[name] = Recorded(columns[start:stop].T, tuple(entries))
-        record = Record(times[first:], signals)
+        record = computed_record(times[first:], signals)
         return self.loop.with_errors(record) if isinstance(self.loop, ClosedLoop) else record
 
 

@@ -15,12 +15,14 @@ import platform
 import re
 import shlex
 import shutil
+import signal
 import stat
 import subprocess
 import sys
 import tempfile
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,6 +43,8 @@ STARTING = 0.05  # The start-up time of a compiler, in s.
 LIMIT = 10.0  # The longest expected compilation under "auto", in s.
 # A compiler that takes longer than this hangs, in s.
 PATIENCE = 600.0
+# Compilers that hung in this process, with the message: each is waited for once.
+_HANGING: dict[str, str] = {}
 
 
 def attempts(compiled: Compiled, operations: int) -> list[tuple[int, bool]]:
@@ -234,7 +238,10 @@ class Compiler(NamedTuple):
 
 def find_compiler() -> Compiler:
     """Returns the C compiler named by CC, or else `cc`, or else that of the package ziglang."""
-    return _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
+    compiler = _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
+    if (name := compiler.command[0]) in _HANGING:
+        raise MachineCodeError(_HANGING[name])
+    return compiler
 
 
 @cache
@@ -287,13 +294,22 @@ def _compile(command: list[str], file: Path) -> None:
 
 
 def _run(command: list[str]) -> "subprocess.CompletedProcess[str]":
-    """Runs a command to its end."""
-    options: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace"}
+    """Runs a command to its end. After a timeout it also ends the child processes."""
+    if command[0] in _HANGING:
+        raise MachineCodeError(_HANGING[command[0]])
+    options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    options |= {"stdin": subprocess.DEVNULL, "errors": "replace", "process_group": 0}
     try:
-        return subprocess.run(command, stdin=subprocess.DEVNULL, timeout=PATIENCE, **options)
+        with subprocess.Popen(command, **options) as process:
+            try:
+                said = process.communicate(timeout=PATIENCE)
+            except BaseException:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                raise
+        return subprocess.CompletedProcess(command, process.returncode, *said)
     except subprocess.TimeoutExpired:
-        raise MachineCodeError(
-            f"the C compiler '{command[0]}' takes longer than {PATIENCE:g} s"
-        ) from None
+        _HANGING[command[0]] = f"the C compiler '{command[0]}' takes longer than {PATIENCE:g} s"
+        raise MachineCodeError(_HANGING[command[0]]) from None
     except (OSError, ValueError) as error:
         raise MachineCodeError(f"the C compiler '{command[0]}' does not run: {error}") from None

@@ -125,6 +125,26 @@ def test_what_is_no_record(tmp_path):
             Record.load(tmp_path / name)
 
 
+def test_numbers_of_a_user_are_checked_and_copied():
+    time, values = np.array([0.0, 1.0]), np.array([[1.0], [2.0]])
+    record = Record(time, {"x": Recorded(values, (Signal("a"),))})
+    values[0], time[0] = 9.0, -1.0
+    assert (record.time[0], record["x"][0, 0]) == (0.0, 1.0)
+    record = Record([0, 1], {"x": Recorded([[1], [2]], (Signal("a"),))})
+    assert record["x"].dtype == float
+    for wrong in (
+        [["1"], ["2"]],
+        [[True], [False]],
+        [[1j], [2]],
+        [[1.0], [None]],
+        [[1.0], [2.0, 3.0]],
+        np.ma.masked_array([[1.0], [2.0]], [[True], [False]]),
+        [1.0, 2.0],
+    ):
+        with pytest.raises(ModelError, match="'x'"):
+            Record([0, 1], {"x": Recorded(wrong, (Signal("a"),))})
+
+
 class Failing(LeafSystem):
     """Two outputs; the second fails after a number of evaluations."""
 

@@ -1,5 +1,6 @@
 """References by name: which outputs a name means, and that rows arrive where they belong."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
@@ -7,6 +8,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_dae import ConstantReference, ExpressionReference, PointToPointReference
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import references_by_name, stack_references
+from drake_dae.references.reference import FormulaReference, Reference
 from drake_dae.systems import TrajectoryReference
 
 OUTPUTS = ["tool.x", "tool.y", "tool.z", "tool.z_axis.x", "left::joint3", "pipe.angle"]
@@ -62,3 +64,33 @@ def test_rows_apart_keep_their_derivatives():
 def test_refusals(references, message):
     with pytest.raises(ReferenceSignalError, match=message):
         references_by_name(references, ["a.x", "a.y"], [2, 2])
+
+
+class Kinked(FormulaReference):
+    size = 1
+
+    def rows(self, time):
+        return ca.fabs(time)
+
+
+class Nothing(Reference):
+    size = 1
+
+    def expression(self, degrees, time):
+        return None
+
+
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [(Kinked(), "row 0 .*not smooth.*PointToPoint"), (Nothing(), r"Nothing.*\(3, 1\).*None")],
+)
+def test_an_own_reference_without_derivatives_is_refused(reference, message):
+    for make in (
+        lambda: reference.derivatives([2]),
+        lambda: stack_references([reference], [2]),
+        lambda: references_by_name({"a": reference}, ["a"], [2]),
+    ):
+        with pytest.raises(ReferenceSignalError, match=message):
+            make()
+    if isinstance(reference, Kinked):
+        assert reference.derivatives([0])(-2.0) == 2.0

@@ -282,8 +282,9 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
         (lambda f: MeasuredSurface((0.4, 0.3), [[0, 1], [0, 1]], scale=-1.0), "scale"),
         (lambda f: MeasuredSurface((0.4, 0.3), [[0, 1e200], [0, 1]]), "1e+200"),
         (lambda f: MeasuredSurface((0.4, 0.3), file=f / "none.npy"), "none.npy"),
+        (lambda f: MeasuredSurface((0.4, 0.3), file=f / "none.csv"), "none.csv': No such file"),
         (lambda f: MeasuredSurface((0.4, 0.3), file=f / "a\0.npy"), "a\0.npy"),
-        (lambda f: MeasuredSurface((0.4, 0.3), file=f), "(.csv)"),
+        (lambda f: MeasuredSurface((0.4, 0.3), file=f), "directory"),
         (lambda f: MeasuredSurface((0.4, 0.3), file=f / "hole.csv"), "row 2, column 1"),
         *(
             (lambda f, kind=kind: MeasuredSurface((0.4, 0.3), file=f / f"words.{kind}"), kind)

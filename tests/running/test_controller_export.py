@@ -13,7 +13,9 @@ from pydrake.systems.primitives import ConstantVectorSource
 from runs import MANY_PIECES, scenario
 
 from drake_dae import CompliantPlant, build_scenario, export_controller, make_closed_loop
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
+from drake_dae.running.c_code import identifiers
 from drake_dae.running.export import ControllerPart, Ticks
 from drake_dae.systems import PointMaterial
 
@@ -290,3 +292,10 @@ def test_ticks_are_the_largest_that_all_times_are_multiples_of():
     # To the bit those of Drake: 9 * 0.001 + 0.0005 is not 19 * 0.0005.
     assert ticks.time(19) == (0.0025 - 0.002) + 9 * 0.001
     assert Ticks([], 0.01).period == 0.01
+
+
+def test_names_that_are_one_in_c_get_members_of_their_own():
+    vectors = {"a b": [Signal("p")], "a_b": [Signal("q"), Signal("r")], "a-b": [Signal("s")]}
+    found = identifiers(vectors)
+    assert len(found) == 3
+    assert list(found.values()) == list(vectors.values())

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drake_dae import DaeSystem
-from drake_dae.errors import MachineCodeWarning, ModelError
+from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
 from drake_dae.trace.compiled import attempts, find_compiler
 from drake_dae.trace.functions import TracedFunction
 
@@ -122,14 +122,26 @@ def test_where_no_compiler_works(cache, monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_compiler_that_hangs_is_not_waited_for_without_end(cache, monkeypatch, tmp_path):
-    """Whether it hangs when it is asked for its version or when it compiles; no clock is read."""
-    only_version = 'case "$*" in *--version*|*-dM*) exit 0;; esac; exec sleep 60'
+def test_a_compiler_that_hangs_is_waited_for_once(cache, monkeypatch, tmp_path):
+    """Whether it hangs when it is asked for its version or when it compiles; no clock is read.
+
+    It ends with its child, which would hold its output open.
+    """
+    asked, module = tmp_path / "asked", "drake_dae.trace.compiled"
+    hangs = f'echo "$@" >> {asked}; sleep 60; exit 1'
+    only_version = f'case "$*" in *--version*|*-dM*) exit 0;; esac; {hangs}'
+    monkeypatch.setattr(f"{module}._HANGING", {})
     # Long enough for a process to start; what it waits for never comes.
-    monkeypatch.setattr("drake_dae.trace.compiled.PATIENCE", 1.0)
-    for name, does in (("cc1", "exec sleep 60"), ("cc2", only_version)):
+    monkeypatch.setattr(f"{module}.PATIENCE", 1.0)
+    for name, does in (("cc1", hangs), ("cc2", only_version)):
+        asked.write_text("")
         monkeypatch.setenv("CC", script(tmp_path / name, does))
         runs_interpreted(name)
+        before = asked.read_text()
+        runs_interpreted(name)
+        assert asked.read_text() == before
+        with pytest.raises(MachineCodeError, match=name):
+            find_compiler()
 
 
 @needs_compiler

@@ -288,9 +288,13 @@ def test_what_cannot_be_rolled_out_is_refused():
         ((start, parameters, [0.0]), "times"),
         ((start, parameters, [0.0, 0.0]), "times"),
         (([start] * 3, [parameters] * 2, [0.0, 0.1]), r"2 .*3 "),
+        (([start] * 2, np.zeros((0, len(parameters))), [0.0, 0.1]), "0 rows .*2 starts"),
     ):
         with pytest.raises(ModelError, match=told):
             rollout(loop, *arguments)
+    for seed in (-1, 2**32, {"any": -1}):  # Also where nothing is random.
+        with pytest.raises(ModelError, match=r"seed .*(-1|4294967296)$"):
+            rollout(loop, start, parameters, [0.0, 0.1], seeds=[seed])
     implicit = SimulatorConfig()
     implicit.integration_scheme, implicit.use_error_control = "implicit_euler", False
     with pytest.raises(ModelError, match="implicit_euler"):
