@@ -10,6 +10,7 @@ import pytest
 from runs import scenario
 
 from drake_dae import CsvReference, MeasuredSurface, Record, load_scenario, new_scenario
+from drake_dae.dae import Signal
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.files import read_bytes, read_text
 from drake_dae.scenario.robot_file.reading import read_robot
@@ -160,3 +161,9 @@ def test_a_robot_that_includes_itself_is_refused(files, chain, tmp_path):
 def test_a_name_that_no_file_can_hold_is_refused(setting):
     with pytest.raises(ScenarioError, match=r"\\ud"):
         scenario("two_link_wall", setting)
+
+
+def test_a_signal_has_a_name_that_a_file_can_hold():
+    with pytest.raises(ModelError, match=r"'\\ud800'"):
+        Signal("\ud800")
+    assert Signal("\u00fc \U0001f916").derivative(1).name == "\u00fc \U0001f916'"

@@ -80,9 +80,9 @@ class SignalRange:
 
     @property
     def share(self) -> float:
-        """How much of the half range between its limits is used; nan without both limits."""
+        """How much of the half range between its limits is used; nan without both, or a range."""
         width = self.high - self.low
-        return 1.0 - 2.0 * self.room / width if np.isfinite(width) else np.nan
+        return 1.0 - 2.0 * self.room / width if 0.0 < width < np.inf else np.nan
 
     @property
     def excess(self) -> Excess | None:

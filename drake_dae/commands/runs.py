@@ -108,11 +108,11 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
     # Its files. A signal from here on takes effect between the record and the pictures.
     record, wanted = recorded(None), scenario.write
-    results = dict[str, Any]()
+    summary, results = None, dict[str, Any]()
     if record.time.size:
-        summary = judge_run(scenario, loop, context, record, statistics, reason)
         try:
             with ending_signals(ending := Interruption()):
+                summary = judge_run(scenario, loop, context, record, statistics, reason)
                 if wanted.record:
                     outputs = record.signals["tracking_error"].signals
                     predicted = Recorded(loop.predicted_error(record), outputs)
@@ -138,8 +138,9 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
                         (place / ANIMATION).write_text(page, encoding="utf-8")
         finally:
             written = [name for name in FILES if (folder / name).exists()]
-            results = {**summary.data, "files": written}
-            print(f"{summary.text}\nwritten to {folder}/: {', '.join(written)}", flush=True)
+            if summary is not None:  # Else it could not be judged.
+                results = {**summary.data, "files": written}
+                print(f"{summary.text}\nwritten to {folder}/: {', '.join(written)}", flush=True)
             if ANIMATION in written:
                 named = shlex.quote(str(folder))
                 plots = "" if wanted.plots else f"; plots: {program()} plot {named} --all"

@@ -58,8 +58,11 @@ def open_page(page: Path) -> None:
 
 def program() -> str:
     """The words before a command that is printed for the user, so that it works as printed."""
-    words = ["drake-dae"] if shutil.which("drake-dae") else [sys.executable, "-m", "drake_dae"]
-    return shlex.join(words)
+    script, found = Path(sys.argv[0]), shutil.which("drake-dae")
+    is_script = script.name == "drake-dae" and script.exists()
+    if found is not None and is_script and script.samefile(found):
+        return script.name
+    return shlex.join([sys.executable, "-m", "drake_dae"])
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from math import inf, prod
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import positive
+from drake_dae.arrays import check_whole_number, positive
 from drake_dae.dae.contact_gains import ContactGains, contact_damping, pole_gains
 from drake_dae.dae.one_direction import DirectionGains, SampledLoop, SensorNoise, sampled_loop
 from drake_dae.errors import GainError, ModelError
@@ -62,7 +62,7 @@ class SensedContact:
     differences; `estimates` tells whether the state comes from a `StateEstimator`.
 
     Raises:
-        ModelError: A number is not positive.
+        ModelError: A number is not positive, or a noise is negative.
     """
 
     period: float
@@ -79,6 +79,10 @@ class SensedContact:
     def __post_init__(self) -> None:
         for name in self.__annotations__.keys() - {"delay", "noise", "estimates"}:
             positive(name, getattr(self, name))
+        check_whole_number("delay", self.delay, 0)
+        for name, value in vars(self.noise).items():
+            if not value >= 0.0:
+                raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
 
     def loop(
         self, rates: DirectionGains, contact: bool, mass_error: float = 1.0, share: float = 1.0

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, numbers, unknown_name
+from drake_dae.arrays import FloatArray, brief, can_be_written, numbers, unknown_name
 from drake_dae.errors import ModelError
 
 Indices = np.typing.NDArray[np.intp]
@@ -34,6 +34,13 @@ class Signal:
 
     name: str
     unit: str = ""
+
+    def __post_init__(self) -> None:
+        if not can_be_written(self.name):
+            raise ModelError(
+                "the name of a signal has half of a letter (\\ud800 to \\udfff), which no file can "
+                f"hold: {self.name!a}"
+            )
 
     def derivative(self, order: int) -> "Signal":
         """Returns the signal of a time derivative: x -> x', x'', ..., with the matching unit."""

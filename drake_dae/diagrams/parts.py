@@ -32,7 +32,7 @@ class LoopSettings:
 
     Attributes:
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
-            force is connected directly, if that closes no algebraic loop.
+            force is connected directly; with rigid joints that closes an algebraic loop.
         encoders: The measurement of the state for the law, at its samples; None for the exact one.
         sampling: The period and delay of the law, with a zero-order hold of its control. None for
             a continuous law, or on a discrete plant for one that is evaluated at each of its steps.

@@ -201,7 +201,7 @@ class JointCoupler(Constraint):
     Attributes:
         follower: Name of the position that follows, as in the links' `position_signals`.
         leader: Name of the position that it follows.
-        ratio: The motion of the follower per unit of the leader.
+        ratio: The motion of the follower per unit of the leader; not zero.
         offset: The follower's position for a leader at zero, in rad or m.
         unit: The unit of the follower's position, "rad" or "m".
         name: The name of the constraint, the prefix of its force and its parameters.
@@ -213,6 +213,13 @@ class JointCoupler(Constraint):
     offset: float = 0.0
     unit: Literal["rad", "m"] = "rad"
     name: str = "coupler"
+
+    def __post_init__(self) -> None:
+        if self.follower == self.leader:
+            raise ModelError(f"'{self.follower}' cannot follow itself; name another leader")
+        if self.ratio == 0.0:
+            raise ModelError("ratio must not be zero; weld the joint if it shall not move")
+        super().__post_init__()
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -1,7 +1,7 @@
 """Links of a robot: M(q), H(q, v), and frames at rest and in motion; links of equations."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.arrays import FloatArray, all_finite, numbers, unknown_name
 from drake_dae.dae import Parameter, Signal, as_expression, places_of, signals
 from drake_dae.dae.signals import is_symbol
 from drake_dae.errors import ModelError
@@ -212,6 +212,32 @@ class Links(Frames):
         """M(q) v' + H(q, v) - tau, shape (nv, 1), with v' of the kinematics."""  # (37)
         inertial = ca.mtimes(self.mass_matrix, kinematics.acceleration) + self.bias
         return inertial - self.generalized_force(kinematics, reaction)
+
+
+def check_links(links: Links) -> None:
+    """Checks signals, limits and actuator data, which can be assigned; see rule 7 of `Links`."""
+    nq, nv, nu = links.q.numel(), links.v.numel(), links.actuation_matrix.shape[1]
+    for kind, size in (("position", nq), ("velocity", nv), ("actuator", nu)):
+        given = getattr(links, name := f"{kind}_signals")
+        found = given if isinstance(given, Sequence) else ()
+        if [isinstance(signal, Signal) for signal in found] != [True] * size:
+            raise ModelError(f"{name} of the links must be {size} Signals, got {given!r}")
+    sizes = {"effort_limits": nu, "reflected_inertia": nu, "gear_ratios": nu}
+    pairs = {"position_limits": nq, "velocity_limits": nv}
+    for name, size in {**sizes, "default_positions": nq, **pairs}.items():
+        given = getattr(links, name)
+        ends = given if name in pairs and isinstance(given, (tuple, list)) else [given]
+        shapes = [isinstance(e, np.ndarray) and e.dtype.kind in "iuf" and e.shape for e in ends]
+        if shapes != [(size,)] * (1 + (name in pairs)):
+            what = "a lower and an upper NumPy array" if name in pairs else "a NumPy array"
+            raise ModelError(f"{name} of the links must be {what} of {size} numbers, got {given!r}")
+        if np.any(np.isnan(ends)) or not ("limits" in name or all_finite(ends[0])):
+            right = "numbers or inf" if "limits" in name else "finite numbers"
+            raise ModelError(f"{name} of the links must be {right}, got {given!r}")
+        if name in pairs and np.any(ends[0] > ends[1]):
+            raise ModelError(f"{name} of the links: a lower limit is above the upper: {given!r}")
+        if name == "effort_limits" and np.any(given < 0.0):
+            raise ModelError(f"{name} of the links must be 0 or more, got {given!r}")
 
 
 def velocities_are_rates(links: Links) -> bool:

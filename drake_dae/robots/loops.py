@@ -176,8 +176,9 @@ class RevoluteLoopJoint(LoopJoint):
     In a planar mechanism the three rows out of the plane are redundant: `planar` keeps only the two
     in the plane.
 
-    The angle is measured within half a turn from zero, and jumps beyond. A joint with full turns
-    may have a damper and a motor, but no limits and no spring.
+    The angle is measured within half a turn from the middle of the limits (from zero without both
+    limits), and jumps beyond. A joint with full turns may have a damper and a motor, but no limits
+    and no spring.
 
     Attributes:
         planar: Whether only the two positions normal to the axis are constrained.
@@ -190,11 +191,18 @@ class RevoluteLoopJoint(LoopJoint):
     def __post_init__(self) -> None:
         super().__post_init__()
         ends = [end for end in (*self.limits, self.rest) if np.isfinite(end)]
-        if any(abs(end) >= pi for end in ends):
+        if any(abs(end - self._middle) >= pi for end in ends):
             raise ModelError(
-                f"lower, upper and rest must be within half a turn of 0, got {brief(ends)}; shift "
-                "rpy_a, or leave out both limits for a continuous joint"
+                f"lower, upper and rest of '{self.name}' must be within half a turn of "
+                f"{self._middle:g} rad, got {brief(ends)}. Leave out both limits for a continuous "
+                "joint"
             )
+
+    @property
+    def _middle(self) -> float:
+        """The middle of the range of the angle."""
+        low, high = self.limits
+        return (low + high) / 2 if np.isfinite(low) and np.isfinite(high) else 0.0
 
     @property
     def held_axes(self) -> tuple[Sequence[str], Sequence[str]]:
@@ -212,7 +220,9 @@ class RevoluteLoopJoint(LoopJoint):
         R_FM, _ = self._relative(frames)
         a = LETTERS.index(self.axis)
         b, c = (a + 1) % 3, (a + 2) % 3  # b x c = a.
-        return ca.atan2(R_FM[c, b] - R_FM[b, c], R_FM[b, b] + R_FM[c, c])
+        sine, cosine = R_FM[c, b] - R_FM[b, c], R_FM[b, b] + R_FM[c, c]
+        s, k = np.sin(self._middle), np.cos(self._middle)
+        return self._middle + ca.atan2(sine * k - cosine * s, cosine * k + sine * s)
 
 
 @checked(ModelError)

@@ -18,7 +18,7 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation import ActuationChain, Stage, chain, diagonal_parameter
 from drake_dae.robots.constraint import Constraint, ConstraintSet
 from drake_dae.robots.couplings import plant_constraints
-from drake_dae.robots.links import Links
+from drake_dae.robots.links import Links, check_links
 from drake_dae.robots.loads import Load
 from drake_dae.robots.loops import LoopState
 from drake_dae.robots.multibody import MultibodyExpressions
@@ -90,6 +90,7 @@ class RobotModel:
         control_weights: ArrayLike | None = None,
         compiled: Compiled = "auto",
     ) -> None:
+        check_links(links)
         self.links, self.name = links, name
         every = (*constraints, *plant_constraints(links))
         self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
@@ -97,6 +98,14 @@ class RobotModel:
         bound = ConstraintSet(self.constraints)
         if forces is None and (outputs is None or not (links.actuator_signals or bound.motors)):
             forces = ()  # The robot is only simulated.
+        for constraint in self.constraints:
+            names = [signal.name for signal in constraint.force_signals]
+            rows = constraint.residual(links).numel() or constraint.rate(links.kinematics()).numel()
+            if rows != len(names):
+                raise ModelError(
+                    f"{name}: constraint '{constraint.name}' has {rows} equations and {len(names)} "
+                    f"forces ({', '.join(names)}); give one force for each equation"
+                )
         self.forces = as_force_outputs(forces, bound)
         S = force_rows(self.forces, bound, links)  # (40)
         h_1 = ca.vertcat(ca.SX(0, 1), *[o.expression(links) for o in self.outputs])  # (39)
@@ -136,6 +145,9 @@ class RobotModel:
         mass = self.dae.matrix("mass_matrix", self.dae.mass_matrix)
         nq, nv = links.velocity_map.shape
         M = mass(self.dae.nominal_state, self.dae.parameter_values)[nq : nq + nv, nq : nq + nv]
+        asymmetry = np.abs(M - M.T).max()
+        if asymmetry > 1e-9 * np.abs(M).max():
+            raise ModelError(f"{name}: M(q) is not symmetric, by {asymmetry:.2g}")
         if (smallest := float(np.linalg.eigvalsh(M)[0])) <= 0.0:
             raise ModelError(
                 f"{name}: M(q) is not positive definite at the nominal configuration: smallest "
@@ -362,6 +374,12 @@ class RobotModel:
         forces, count = self._num_forces, self._num_forces + len(positions)
         nu = len(actuators) + len(motors)
         given = f"{forces} constraint forces and {len(positions)} positions ({names})"
+        if nu == 0 and count:
+            raise ModelError(
+                f"{self.name}: there are no actuators, so nothing can be steered: not {given}. To "
+                "simulate it leave both out; to steer it give joints actuators, by "
+                "plant.AddJointActuator or a <transmission>"
+            )
         if is_chosen:
             if not 0 < count < nu:
                 raise ModelError(

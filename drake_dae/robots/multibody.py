@@ -24,6 +24,7 @@ from pydrake.multibody.tree import (
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae import Parameter, Signal
+from drake_dae.dae.signals import LARGEST
 from drake_dae.errors import ModelError
 from drake_dae.robots.links import ORIGIN, Application, Kinematics, Links, Reaction, position_index
 from drake_dae.robots.plant_frames import (
@@ -192,8 +193,10 @@ class MultibodyExpressions(Links):
         self.effort_limits = np.array([a.effort_limit() for a in actuators])
         self.gear_ratios = np.array([a.default_gear_ratio() for a in actuators])
         for actuator, ratio in zip(actuators, self.gear_ratios, strict=True):
-            if ratio == 0.0:
-                raise ModelError(f"the gear ratio of '{actuator.name()}' must not be 0")
+            if not (np.isfinite(ratio) and ratio != 0.0):
+                raise ModelError(
+                    f"the gear ratio of '{actuator.name()}' is {ratio:g}; it must be another number"
+                )
         self.reflected_inertia = np.array([a.default_reflected_inertia() for a in actuators])
         # As in Drake, the last of several actuators of a joint is used.
         self._rotors = np.zeros(plant.num_velocities())
@@ -233,6 +236,13 @@ class MultibodyExpressions(Links):
 
     def _read_springs(self, joints: Sequence[Joint]) -> None:
         """The generalized force of dampers and springs, shape (nv, 1)."""
+        for joint in joints:
+            largest = np.max(joint.default_damping_vector(), initial=0.0)
+            if largest > LARGEST:
+                raise ModelError(
+                    f"joint '{joint.name()}' has a damping of {largest:g}, and the largest that "
+                    f"can be computed with is {LARGEST:g}"
+                )
         damping = np.concatenate([joint.default_damping_vector() for joint in joints])
         force = -ca.SX(damping) * self.v
         for i in range(self.plant.num_force_elements()):

@@ -284,3 +284,7 @@ class FrictionCone:
     def __post_init__(self) -> None:
         object.__setattr__(self, "tangents", tuple(self.tangents))
         positive("limit", self.limit)
+        if not 1 <= len(self.tangents) <= 2:
+            raise ModelError(
+                f"a friction cone has one or two tangential forces, got {len(self.tangents)}"
+            )

@@ -188,7 +188,13 @@ class ExpressionOutput(PositionOutput):
 
     def expression(self, links: Links) -> ca.SX:
         given = result_of("function", self.function, links)
-        return ca.vec(as_expression("an ExpressionOutput", "its function", given))
+        value = ca.vec(as_expression("an ExpressionOutput", "its function", given))
+        if value.numel() != len(self.outputs):
+            raise ModelError(
+                f"an output function returned {value.numel()} components, named were "
+                f"{', '.join(signal.name for signal in self.outputs)}"
+            )
+        return value
 
     def signals(self, links: Links) -> tuple[Signal, ...]:
         return tuple(self.outputs)
@@ -293,6 +299,10 @@ def as_force_outputs(
     if forces is None:
         forces = [signal.name for signal in constraints.force_signals]
     outputs = tuple(ForceCombination({f: 1.0}, f) if isinstance(f, str) else f for f in forces)
+    names = [signal.name for output in outputs for signal in output.signals(constraints)]
+    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+    if twice:
+        raise ModelError(f"a force output is named twice: {', '.join(twice)}")
     return outputs
 
 

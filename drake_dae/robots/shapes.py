@@ -30,6 +30,12 @@ from drake_dae.trace.expressions import check_names, length_of, parse_formula, r
 _SOLID_LENGTH = 100.0
 """The length of the solid of a cylinder, in m: its ends are out of the reach of a robot."""
 
+_TAKEN = (
+    *("position", "rpy", "force", "distance"),
+    *("friction", "stiction_tolerance", "viscous_friction"),
+)
+"""Names that constraints use for their own parameters and signals."""
+
 
 @checked(ModelError)
 @dataclass(frozen=True)
@@ -259,7 +265,7 @@ class ImplicitSurface(Surface):
         super().__post_init__()
         object.__setattr__(self, "parameters", dict(self.parameters))
         object.__setattr__(self, "_shape", ca.SX(ca.DM(list(self.parameters.values()))))
-        check_names(self.parameters, tuple("xyz"))
+        check_names(self.parameters, (*"xyz", *_TAKEN))
         if isinstance(self.function, str):
             value = self._function(ca.SX.sym("p", 3))
             if value.is_constant():

@@ -146,7 +146,10 @@ class RunSummary:
         kinds = {*LimitKind} - ({LimitKind.FORCE} if "contact_force" in record else set())
         beyond = [r.excess for r in self.ranges if r.kind in kinds and r.excess is not None]
         for excess in sorted(beyond, key=lambda e: -abs(e.value / e.limit) if e.limit else -np.inf):
-            more = excess.signal, excess.value, excess.limit, excess.time, ANALYZE
+            # A task and a free motion have no references, and a pace changes no position.
+            is_paced = not self.changes and record["desired_output"].size
+            cause = ANALYZE if is_paced and excess.kind is not LimitKind.POSITION else ""
+            more = excess.signal, excess.value, excess.limit, excess.time, cause
             found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *more))
         found += self.more
         if self.changes:

@@ -1,5 +1,6 @@
 """Runs a diagram: progress, clean interruption, and statistics."""
 
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -172,8 +173,7 @@ class _Progress:
             disable=None if is_shown else True,  # None: without a terminal.
             file=sys.stderr,
             bar_format=form,
-            ncols=79,
-            nrows=24,  # Some containers report neither.
+            **default_size(),
         )
         self._began = self._last = time.perf_counter()
 
@@ -191,3 +191,13 @@ class _Progress:
     def close(self) -> None:
         with suppress(OSError):
             self._bar.close()
+
+
+def default_size() -> dict[str, int]:
+    """The size for tqdm if the terminal reports no columns, as in some containers."""
+    try:
+        if os.get_terminal_size(sys.stderr.fileno()).columns > 0:
+            return {}
+    except (OSError, ValueError, AttributeError):  # Of what is no terminal, nor a file.
+        pass
+    return {"ncols": 79, "nrows": 24}

@@ -39,7 +39,7 @@ from drake_dae.errors import (
 )
 from drake_dae.running.interruption import end_at_once, ending_signals
 from drake_dae.running.rollout_program import program_of
-from drake_dae.running.simulate import simulate
+from drake_dae.running.simulate import default_size, simulate
 from drake_dae.scenario.build import build_completed, for_rollout, roll_scenario
 from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.parts import Matrices
@@ -138,9 +138,9 @@ def sweep(
                     ahead, opened = 4 * count, _processes(count, time_limit, most)
                 else:
                     opened = nullcontext(lambda *args: executor.submit(run_one, *args))
-                size = {"total": len(chosen), "initial": len(done), "ncols": 79, "nrows": 24}
+                size = {"total": len(chosen), "initial": len(done), "unit": "run"}
                 is_hidden = None if progress else True  # None: without a terminal.
-                with opened as submit, tqdm(**size, unit="run", disable=is_hidden) as bar:
+                with opened as submit, tqdm(**size, disable=is_hidden, **default_size()) as bar:
                     _run(todo, lambda run: submit(settings, chosen[run]), ahead, journal, bar)
             results = journal.results()
     return Study(tuple(chosen), tuple(results[run] for run in range(len(chosen))))

@@ -20,7 +20,7 @@ MOST_RUNS = 1_000_000  # The largest number of runs of a sweep; more would take 
 Variation = dict[str, Any]  # Dotted key of a scenario -> its value in one run, as plain data.
 
 _NUMBER = r"([-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)"
-_INTERVAL = re.compile(rf"\s*{_NUMBER}\.\.{_NUMBER}(?::([0-9]{{1,6}}))?\s*")
+_INTERVAL = re.compile(rf"\s*{_NUMBER}\.\.{_NUMBER}(?::([0-9]{{1,18}}))?\s*")
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -80,12 +80,16 @@ def _listed(key: str, values: Any) -> list[Any]:
         if number < 2:
             text = f"{values} needs the number of its values, {values}:11, or random values"
             raise ScenarioError((key, text if not number else f"at least 2 values, got {values}"))
+        _check_count(number)
         found = np.linspace(low, high, number).tolist()
         is_whole = all(value.is_integer() for value in found)
         return [int(value) for value in found] if is_whole else found
-    listed = plain(key, list(values) if isinstance(values, range) else values)
+    listed = plain(key, [*values[: MOST_RUNS + 1]] if isinstance(values, range) else values)
     if not isinstance(listed, list) or not listed:
         raise ScenarioError((key, f"expected a list of values, got {brief(values)}"))
+    if len(listed) > MOST_RUNS:
+        text = f"a sweep has at most {MOST_RUNS} runs, got {brief(values)}"
+        raise ScenarioError((key, text))
     return listed
 
 

@@ -18,6 +18,7 @@ from drake_dae import Record, load_scenario
 from drake_dae.cli import main
 from drake_dae.commands import runs, scenarios
 from drake_dae.commands.runs import FILES
+from drake_dae.commands.writing import program
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.pictures import PLOTS
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
@@ -169,6 +170,20 @@ def test_a_printed_command_works_as_printed(tmp_path):
     assert shlex.split(play)[0] == sys.executable
 
 
+@pytest.mark.parametrize("first", ["own", "other"])
+def test_a_printed_command_is_that_of_this_installation(first, tmp_path, monkeypatch):
+    for name in ("own", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "drake-dae").write_text("#!/bin/sh\n")
+        (tmp_path / name / "drake-dae").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / first))
+    monkeypatch.setattr(sys, "argv", [str(tmp_path / "own" / "drake-dae")])
+    module = shlex.join([sys.executable, "-m", "drake_dae"])
+    assert program() == ("drake-dae" if first == "own" else module)
+    monkeypatch.setattr(sys, "argv", [str(tmp_path / "drake_dae" / "__main__.py")])
+    assert program() == module
+
+
 @pytest.mark.slow
 def test_meshcat_reports_where_and_asks_drake_for_real_time(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--meshcat", "--out", str(tmp_path), *QUICK]
@@ -179,12 +194,15 @@ def test_meshcat_reports_where_and_asks_drake_for_real_time(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_bar_on_a_terminal(tmp_path):
-    """One that does not know its width, as in some containers."""
+@pytest.mark.parametrize(("columns", "width"), [(0, 79), (60, 60)])
+def test_a_bar_on_a_terminal(columns, width, tmp_path):
+    """One that does not know its width, as in some containers, or is narrow."""
     settings = ["--set", "duration=0.5", "--set", "integrator.target_realtime_rate=1"]
-    shown = shown_on_a_terminal(["simulate", "two_link_wall", *BARE, *settings], cwd=tmp_path)
+    words = ["simulate", "two_link_wall", *BARE, *settings]
+    shown = shown_on_a_terminal(words, columns, cwd=tmp_path)
     steps = shown.rstrip().split("\r")
     assert len(steps) > 3
+    assert width - 2 <= max(map(len, steps)) <= width
     assert re.search(r"100%\|.*\| 0\.50/0\.50 s, \d+\.\d x real time", steps[-1])
 
 

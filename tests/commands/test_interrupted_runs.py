@@ -12,9 +12,11 @@ from command_line import QUICK, command
 from runs import scenario, some
 
 from drake_dae import Record, simulate
+from drake_dae.cli import main
 from drake_dae.commands.writing import complete
 from drake_dae.running.interruption import ENDING_SIGNALS, end_at_once, ending_signals
 from drake_dae.scenario.build import build_scenario
+from drake_dae.scenario.judging import judge_run
 
 
 @pytest.mark.usefixtures("signals_of_a_shell")
@@ -55,6 +57,21 @@ def test_each_signal_in_the_middle_of_a_run(tmp_path):
             inner, last = undisturbed[name][: count - 1], undisturbed[name][count - 1]
             np.testing.assert_array_equal(record[name][:-1], inner, name)
             np.testing.assert_allclose(record[name][-1], last, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", some([signal.SIGINT, signal.SIGTERM]))
+def test_a_signal_while_a_run_is_judged_leaves_its_files(sent, tmp_path, monkeypatch, capsys):
+    def judged(*arguments):
+        signal.raise_signal(sent)
+        return judge_run(*arguments)
+
+    monkeypatch.setattr("drake_dae.commands.runs.judge_run", judged)
+    words = ["simulate", "two_link_wall", "--set=duration=0.1", "--out", str(tmp_path / "run")]
+    assert main(words) == 128 + sent
+    left = sorted(path.name for path in (tmp_path / "run").iterdir())
+    assert left == ["record.npz", "scenario.yaml", "summary.txt"]
+    assert "tracking error" in capsys.readouterr().out
 
 
 LOADING = """

@@ -126,3 +126,16 @@ def test_an_error_that_no_gains_keep_is_refused_with_what_forbids_it():
         advised_gains(bad, 0.2, position_error=1.1 * least)
     with pytest.raises(ModelError, match="position_error"):
         advised_gains(good, 1.0, position_error=0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"delay": -1}, "delay.*-1"),
+        ({"noise": SensorNoise(force=-0.1)}, "force.*-0.1"),
+        ({"noise": SensorNoise(position=float("nan"))}, "position.*nan"),
+    ],
+)
+def test_a_negative_delay_or_noise_is_refused(change, message):
+    with pytest.raises(ModelError, match=message):
+        replace(situation(1e-4, 1e5, 0.03, 1), **change)

@@ -7,6 +7,7 @@ Drake's, with the damping, spring, limits and motor that it had.
 
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -204,13 +205,31 @@ def test_what_the_loop_joint_exerts_is_what_drakes_joint_does(cut):
     assert len(found) == 5
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.0, 4.5), (-0.5, 3.5)])
+def test_the_angle_counts_from_the_middle_of_its_limits(low, high):
+    """In a chain that is closed by nothing else: 3 rad beyond a middle of 2 is 5, and not -1.28."""
+    loop = RevoluteLoopJoint("world", "link1", "z", lower=low, upper=high, damping=1.0)
+    plant = MultibodyPlant(0.0)
+    body = plant.AddRigidBody("link1", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.AddJoint(
+        RevoluteJoint("turn", plant.world_frame(), body.body_frame(), np.array([0.0, 0.0, 1.0]))
+    )
+    plant.Finalize()
+    model = RobotModel.from_multibody(plant, [], [])
+    angle = ca.Function("c", [model.links.q], [loop.coordinates(model.links)])
+    middle = (low + high) / 2.0
+    for value in middle + np.array([-3.0, -1.5, 1.0, 3.0]):
+        assert float(angle(value)) == pytest.approx(value, abs=1e-14)
+    assert float(angle(middle + 3.2)) == pytest.approx(middle + 3.2 - 2.0 * np.pi, abs=1e-14)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: RevoluteLoopJoint("a", "b", "w"), "axis"),
         (lambda: RevoluteLoopJoint("a", "b", damping=-1.0), "damping"),
         (lambda: RevoluteLoopJoint("a", "b", lower=1.0, upper=0.5), "lower.*upper"),
-        (lambda: RevoluteLoopJoint("a", "b", upper=3.5), "3.5"),
+        (lambda: RevoluteLoopJoint("a", "b", upper=3.5, name="knee"), "'knee'.*3.5"),
         (lambda: RevoluteLoopJoint("a", "b", effort_limit=3.0), "effort_limit|motor"),
         (lambda: RevoluteLoopJoint("a", "b", velocity_limit=0.0), "velocity_limit"),
         (lambda: PrismaticLoopJoint("a", "b", "x", normal="x"), "'x'"),

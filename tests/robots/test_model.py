@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, consistent_states, numbers
+from members import Mirror
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
@@ -15,6 +16,7 @@ from drake_dae import (
     AxisCoordinates,
     CoincidentPoints,
     ExpressionOutput,
+    JointCoupler,
     JointPositions,
     LinkExpressions,
     Plane,
@@ -31,6 +33,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.robots import FrictionCone
 from drake_dae.trace.functions import TracedFunction
 
 WALL = PointOnSurface("tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")
@@ -51,9 +54,9 @@ def textbook_links(**changes):
     return LinkExpressions(**{**given, **changes})
 
 
-def textbook(outputs=None, constraints=(WALL,), **changes):
+def textbook(outputs=None, constraints=(WALL,), forces=None, **changes):
     outputs = [PointCoordinates("tool", "z")] if outputs is None else outputs
-    return RobotModel(textbook_links(**changes), constraints, outputs, [1.2, -1.6])
+    return RobotModel(textbook_links(**changes), constraints, outputs, [1.2, -1.6], forces=forces)
 
 
 @pytest.mark.equation(43, 44, 45)
@@ -131,12 +134,58 @@ def test_two_motors_on_one_joint_share_its_torque_by_their_weights():
         (lambda: textbook(mass_matrix=ca.DM.eye(3)), r"mass_matrix.*\(3, 3\)"),
         (lambda: textbook(actuation_matrix=np.eye(3)), r"actuation_matrix.*\(3, 3\)"),
         (lambda: textbook(constraints=[WALL, WALL], outputs=[]), "wall"),
-        (lambda: textbook(outputs=[ExpressionOutput(lambda links: links.q, [Signal("a")])]), "2"),
+        (lambda: textbook(mass_matrix=ca.DM([[2, 1], [0, 2]])), "not symmetric, by 1"),
+        (lambda: textbook(forces=["wall.force"] * 2, outputs=[]), "named twice: wall.force"),
+        (lambda: textbook(actuation_matrix=np.zeros((2, 0))), "no actuators"),
+        (lambda: textbook(constraints=[Unequal(0, 1, 0.0)], outputs=[]), "'mirror' has 2.*1 force"),
+        (lambda: FrictionCone("wall.force", [], 0.3), "got 0"),
+        (lambda: FrictionCone("wall.force", ["a", "b", "c"], 0.3), "got 3"),
+        (lambda: JointCoupler("q0", "q0"), "'q0' cannot follow itself"),
+        (lambda: JointCoupler("q0", "q1", ratio=0.0), "ratio"),
+        *(
+            (lambda of=of, names=names: textbook(outputs=[ExpressionOutput(of, names)]), message)
+            for of, names, message in (
+                (lambda links: links.q, [Signal("a")], "returned 2 components, named were a"),
+                (lambda links: None, [Signal("a"), Signal("b")], "returned 1.*named were a, b"),
+            )
+        ),
     ],
 )
 def test_refusals(make, message):
     with pytest.raises(ModelError, match=message):
         make()
+
+
+class Unequal(Mirror):
+    """Two equations and one force."""
+
+    def residual(self, frames):
+        return frames.q
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("position_signals", (Signal("a"),)),
+        ("velocity_signals", ["a", "b"]),
+        ("actuator_signals", None),
+        ("effort_limits", np.ones(3)),
+        ("effort_limits", [1.0, 2.0]),
+        ("effort_limits", -np.ones(2)),
+        ("reflected_inertia", np.ones(1)),
+        ("gear_ratios", np.array([1.0, np.inf])),
+        ("gear_ratios", np.array(["a", "b"])),
+        ("default_positions", np.zeros(3)),
+        ("position_limits", (np.ones(2), -np.ones(2))),
+        ("position_limits", np.ones(2)),
+        ("velocity_limits", (np.zeros(2), np.array([1.0, np.nan]))),
+    ],
+)
+def test_attributes_of_links_that_do_not_fit_are_named(name, value):
+    links = textbook_links()
+    setattr(links, name, value)
+    with pytest.raises(ModelError, match=name):
+        RobotModel(links, [WALL], [PointCoordinates("tool", "z")])
 
 
 def four_bar(folder, far=0.3):

@@ -17,6 +17,7 @@ from pydrake.multibody.tree import (
     JacobianWrtVariable,
     LinearBushingRollPitchYaw,
     QuaternionFloatingJoint,
+    RevoluteJoint,
     WeldJoint,
 )
 from random_plants import (
@@ -206,6 +207,13 @@ def test_multi_dof_joints_are_named_by_suffix():
     assert units[f"{screw}_w"] == "rad/s"
 
 
+def geared(ratio):
+    plant = one_body(revolute, finalize=False)
+    plant.AddJointActuator("motor", plant.GetJointByName("joint")).set_default_gear_ratio(ratio)
+    plant.Finalize()
+    return plant
+
+
 def with_bushing():
     plant = one_body(revolute, finalize=False)
     frames = plant.world_frame(), plant.GetFrameByName("box")
@@ -223,6 +231,12 @@ def with_bushing():
         (lambda: one_body(QuaternionFloatingJoint), "'joint'.*quaternion_floating"),
         (lambda: one_body(lambda *args: WeldJoint(*args, RigidTransform())), "joint"),
         (with_bushing, "LinearBushingRollPitchYaw"),
+        (
+            lambda: one_body(lambda *args: RevoluteJoint(*args, [0, 0, 1], damping=1e300)),
+            r"'joint'.*1e\+300",
+        ),
+        (lambda: geared(np.inf), "'motor' is inf"),
+        (lambda: geared(np.nan), "'motor' is nan"),
     ],
 )
 def test_what_is_not_supported_is_refused_with_a_remedy(make, message):

@@ -187,6 +187,7 @@ def test_distance_from_a_torus_is_that_of_the_nearest_point():
         (lambda: Cylinder((0, 0, 0), (0, 0, 2), 1.0, zero=(0, 0, -3)), "zero"),
         (lambda: Ellipsoid((0, 0, 0), (1, 0, 1)), "semi_axes"),
         (lambda: Torus((0, 0, 0), (0, 0, 1), 0.2, 0.3), "minor_radius"),
+        (lambda: ImplicitSurface("x - force", parameters={"force": 1.0}), "'force'"),
         (lambda: ImplicitSurface(lambda p: p).distance(ca.SX.sym("p", 3)), r"\(3, 1\)"),
         (
             lambda: SurfaceCoordinates(PointOnSurface("tool", ImplicitSurface("x"), name="wall")),

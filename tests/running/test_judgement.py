@@ -8,7 +8,7 @@ import pytest
 from drake_dae import Record, Signal
 from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
-from drake_dae.running.judgement import FindingKind, Outcome, RunSummary, late_rms
+from drake_dae.running.judgement import ANALYZE, FindingKind, Outcome, RunSummary, late_rms
 from drake_dae.systems.controller import PhaseChange
 
 TIMES = np.linspace(0.0, 10.0, 1001)
@@ -151,6 +151,26 @@ def test_a_limit_that_is_left_is_bad_with_its_numbers():
     signals = {**compliant.signals, "contact_force": Recorded(np.zeros((1001, 1)), (WALL,))}
     found = judged(Record(TIMES, signals), ranges=[force_range(-0.5)])
     assert found.outcome is Outcome.GOOD
+
+
+def test_slower_references_are_advised_where_there_are_some():
+    def advised(record=None, **options):
+        options = {"ranges": [force_range(-0.5)]} | options
+        return ANALYZE in judged(record or run(), **options).look_next
+
+    free, nothing = run(), Recorded(np.zeros((TIMES.size, 0)), ())
+    free = Record(TIMES, free.signals | {"desired_output": nothing, "tracking_error": nothing})
+    assert advised()
+    assert not advised(free)
+    assert not advised(changes=BEGIN)
+    assert not advised(ranges=[force_range(-0.5, LimitKind.POSITION)])
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5])
+def test_a_range_of_width_0_has_no_share(value):
+    beyond = 0.0 if value else None
+    fixed = SignalRange(WALL, LimitKind.POSITION, 0.0, 0.0, value, 0.0, 0.0, 0.0, beyond)
+    assert np.isnan(fixed.share)
 
 
 def change(time, phase, place, reason, failed=False):

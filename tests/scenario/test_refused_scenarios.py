@@ -65,6 +65,8 @@ REFUSED = {
     "two_link_wall": {
         f"constraints.0={ROD}": "constraints.0: |'rod.length'",
         "forces=[wall]": "forces.0: |'wall'|wall.force",
+        "forces=[wall.force, wall.force]": "forces: a force output is named twice: wall.force",
+        "robot.actuators=[]": "outputs: |no actuators",
         # Settings and the run.
         "duration": "--set duration: ",
         "duration=[1": "duration: |line 1: ",

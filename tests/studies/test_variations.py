@@ -55,6 +55,7 @@ def parsed(*texts, count=None, seed=0, together=False):
     ("text", "values"),
     [
         ("duration=1..2:3", [1, 1.5, 2]),
+        ("sampling.seed=1..1000000:1000000", range(1, 1_000_001)),
         ("duration=[1, 2.5]", [1, 2.5]),
         ("duration=1.5", [1.5]),
         ("sensors.force.seed=1..3:3", [1, 2, 3]),
@@ -111,6 +112,8 @@ def test_ranges_within_a_value_are_drawn_each_on_its_own():
         ),
         (["duration=1..2"], {"count": 0}, r"count.*0"),
         (["duration=1..2"], {"count": 1, "seed": -1}, r"seed.*-1"),
+        (["duration=0..1:1000001"], {}, r"1000000.*1000001"),
+        (["duration=0..1:9999999999"], {}, r"1000000.*9999999999"),
         (["duration=1..2:900000", "sensors.force.seed=1..9:9"], {}, r"1000000.*8100000"),
     ],
 )
@@ -128,7 +131,8 @@ def test_what_cannot_be_read_is_reported(texts, options, words):
         ({"a": range(0)}, 2, r"\ba\b"),
         ({"a": "text"}, 2, r"\ba\b"),
         ({"a": [object()]}, 2, r"\ba\b"),
-        ({"a": "1..2:1000000"}, None, r"\ba\b"),
+        ({"a": range(10**300)}, None, "1000000"),
+        ({"a": range(10**9)}, 2, "1000000"),
     ],
 )
 def test_ranges_that_make_no_sense_are_refused(values, count, words):

@@ -1,9 +1,12 @@
 """The command line in a process of its own, and what short runs are asked for."""
 
+import fcntl
 import os
 import pty
+import struct
 import subprocess
 import sys
+import termios
 
 QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
 
@@ -24,9 +27,12 @@ def command(*arguments, **options):
     )
 
 
-def shown_on_a_terminal(arguments, **options):
-    """What a command writes to stderr where that is a terminal that does not know its width."""
+def shown_on_a_terminal(arguments, columns=0, **options):
+    """What a command writes to stderr, a terminal; one of 0 columns does not know its width."""
     ours, theirs = pty.openpty()
+    fcntl.ioctl(
+        theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24 if columns else 0, columns, 0, 0)
+    )
     process = subprocess.Popen(
         [sys.executable, "-m", "drake_dae", *map(str, arguments)],
         stdout=subprocess.DEVNULL,

@@ -8,8 +8,9 @@ unless `leave_out` names it.
 import logging
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
+from threading import get_native_id
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, tostring
 
@@ -45,7 +46,9 @@ _SERVOS = ("position", "velocity", "intvelocity", "general")
 _ACTUATORS = (*_SERVOS, "motor", "damper", "cylinder")
 """What in a class has one default, under any of these names."""
 
-_OF_GENERAL = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}
+_LAW = ("dyntype", "gaintype", "biastype")
+
+_OF_GENERAL = {*_LAW, "dynprm", "gainprm", "biasprm"}
 """What motors and servos set themselves, whatever is the default."""
 
 _PROBES = {
@@ -97,8 +100,8 @@ class Mender:
                     if "," in value and number_in(value.replace(",", ".", 1)) is not None:
                         text = f"'{value}': numbers have a point, no comma"
                         raise ModelError(f"{place_of(node)}: {text}")
-                    if "://" in value:
-                        self.files.find(value, file)  # What is missing is collected.
+            for mesh in root.iterfind(".//link/*/geometry/mesh"):
+                self.files.find(_uri_of(mesh), file)  # What is missing is collected.
             # Only the armature of joints without motor is lost.
             for part, place in take_lost(root, kind, {*self.leave_out} - {ARMATURE}):
                 self.lose(part, place)
@@ -170,8 +173,7 @@ class Mender:
         for shape in [*link.iterfind("visual"), *link.iterfind("collision")]:
             is_visual, is_kept = shape.tag == "visual", True
             for mesh in shape.iterfind("geometry/mesh"):
-                uri = mesh.find("uri")
-                text = mesh.get("filename", "") if uri is None else (uri.text or "").strip()
+                uri, text = mesh.find("uri"), _uri_of(mesh)
                 found = self.files.find(text, file)
                 path = self._mesh(text, found, not is_visual, kinds if is_visual else ())
                 if uri is None:
@@ -289,20 +291,29 @@ class Mender:
             for constraint in list(equality):
                 if constraint.attrib.pop("active", "true") == "false":
                     equality.remove(constraint)
+        for joint in root.iter("joint"):  # MuJoCo takes an empty range for none.
+            is_empty = not any(map(number_in, joint.get("range", "").split()))
+            if joint.get("limited", "auto") in ("false", *["auto"] * is_empty):
+                joint.attrib.pop("range", None)
         kinds = {one.get("name", ""): one.get("type", "hinge") for one in root.iter("joint")}
         kinds |= {one.get("name", ""): "free" for one in root.iter("freejoint")}
         for owner, motor in [(one, motor) for one in root.iterfind("actuator") for motor in one]:
-            if motor.tag in _SERVOS:  # Its control is no effort, and neither are its limits.
+            law = motor.attrib.keys() & _OF_GENERAL if motor.tag in _SERVOS else set()
+            own, gain = {key: motor.attrib.pop(key) for key in law}, 1.0
+            if motor.tag == "general" and {own.get(k, "") for k in _LAW} <= {"", "none", "fixed"}:
+                motor.tag = "motor"  # Of a control in another unit.
+                gain = abs(_first(own.get("gainprm", "")))
+            elif motor.tag in _SERVOS:  # Its control is no effort, and neither are its limits.
                 motor.tag = "motor"
                 text = "servos become motors without their gains: controls are efforts"
                 self.tell(text, f"'{motor.get('name', motor.get('joint', ''))}'")
-                for key in ("ctrlrange", "ctrllimited", *_OF_GENERAL):
+                for key in ("ctrlrange", "ctrllimited"):
                     motor.attrib.pop(key, None)
-            gear = abs(number_in([*motor.get("gear", "").split(), "1"][0]) or 1.0)
-            for key in ("ctrlrange", "forcerange"):
+            gear = abs(_first(motor.get("gear", "")))
+            for key, scale in (("ctrlrange", gain * gear), ("forcerange", gear)):
                 bounds = [number_in(word) for word in motor.get(key, "").split()]
-                if gear != 1.0 and bounds and None not in bounds:
-                    motor.set(key, " ".join(repr(gear * (bound or 0.0)) for bound in bounds))
+                if scale != 1.0 and bounds and None not in bounds:
+                    motor.set(key, " ".join(repr(scale * (bound or 0.0)) for bound in bounds))
             kind = kinds.get(motor.get("joint", ""))
             if motor.tag == "motor" and kind in _OF_MANY_AXES:
                 owner.remove(motor)
@@ -349,7 +360,7 @@ class Mender:
         """Leaves out what of the geometry Drake cannot take, unless a body has its mass from it."""
         options, meshes, paths = _compiler(root), dict[str, Element](), dict[str, str]()
         folder = file.resolve().parent / options.get("meshdir", options.get("assetdir", ""))
-        for mesh in root.iterfind("asset/mesh"):
+        for mesh in root.iterfind("asset/mesh[@file]"):  # Drake reads no others.
             mesh.attrib.setdefault("name", Path(mesh.get("file", "")).stem)
             meshes[mesh.get("name", "")] = mesh
         shells = {
@@ -427,23 +438,38 @@ def _compiler(root: Element) -> dict[str, str]:
     return {key: value for one in root.iterfind("compiler") for key, value in one.items()}
 
 
+def _first(words: str) -> float:
+    """The first number, and 1 if there is none, or 0."""
+    return number_in([*words.split(), "1"][0]) or 1.0
+
+
+def _uri_of(mesh: Element) -> str:
+    """The file that a mesh of URDF or SDFormat names."""
+    return mesh.get("filename", mesh.findtext("uri", "")).strip()
+
+
 def _collides(geom: Element) -> bool:
     """Whether a geometry of MJCF collides, and is not only drawn."""
     return {geom.get("contype", "1"), geom.get("conaffinity", "1")} != {"0"}
 
 
-@cache
+@lru_cache(10000)
 def _is_read(kind: str, text: str) -> bool:
     """Whether Drake makes geometry of a model with a lone shape."""
     plant, scene_graph, logger = MultibodyPlant(0.0), SceneGraph(), logging.getLogger("drake")
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    was, logger.disabled = logger.disabled, True
+    here = get_native_id()
+
+    def is_elsewhere(record: logging.LogRecord) -> bool:
+        return record.thread != here
+
+    logger.filters.insert(0, is_elsewhere)  # Before those that tell what Drake logs.
     try:
         Parser(plant).AddModelsFromString(text, kind)
     except (RuntimeError, ValueError, SystemExit):  # The last: a failed assertion of Drake.
         return False
     finally:
-        logger.disabled = was
+        logger.removeFilter(is_elsewhere)
     return scene_graph.model_inspector().num_geometries() > 0
 
 

@@ -1,9 +1,11 @@
 """The tables of what Drake reads of robot files, fed through Drake part by part."""
 
+import logging
 import re
 import warnings
 from copy import deepcopy
 from pathlib import Path
+from threading import Event, Thread
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -16,6 +18,7 @@ from pydrake.multibody.tree import FrameIndex
 from pydrake.solvers import MathematicalProgram
 
 from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning
+from drake_dae.scenario.robot_file import mending
 from drake_dae.scenario.robot_file.read_by_drake import READ_BY_DRAKE, read_xml, write_xml
 from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
@@ -237,6 +240,8 @@ HARMLESS = rows("""
 .xml | <joint name="l" |  stiffness="0" solreflimit="0.1 1" margin="1"
 .xml | </mujoco> | <default><joint stiffness="0"/></default><sensor/><worldbody><light/></worldbody>
 .xml | <equality/> | <equality><joint joint1="j" joint2="k" active="false"/></equality>
+.xml | <joint name="l" |  range="0 0"
+.xml | </mujoco> | <asset><mesh vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
 """)
 
 
@@ -349,16 +354,46 @@ def test_what_drake_remarks_is_one_warning_with_the_users_file(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "tag", ["position", "velocity", "intvelocity", 'general gainprm="3 0 0" biastype="affine"']
+    ("words", "limit"),
+    [
+        ('range="0 0"', np.inf),
+        ('range="0 0" limited="auto"', np.inf),
+        ('range="-1 1" limited="false"', np.inf),
+        ('range="0 0" limited="true"', 0.0),
+        ('range="-1 1"', 1.0),
+    ],
 )
-def test_servos_become_motors_with_their_limits_of_efforts(tag, tmp_path):
+def test_an_empty_range_of_mjcf_is_none(words, limit, tmp_path):
+    text = one_joint(".xml", "hinge", words)
+    (tmp_path / "robot.xml").write_text(
+        text.replace("<worldbody>", "<compiler angle='radian'/><worldbody>")
+    )
+    joint = read_robot(Robot(str(tmp_path / "robot.xml")))[0].GetJointByName("j")
+    np.testing.assert_allclose(joint.position_upper_limits(), limit)
+
+
+@pytest.mark.parametrize(
+    ("tag", "limit"),
+    [
+        ("position", 8.0),
+        ("velocity", 8.0),
+        ("intvelocity", 8.0),
+        ('general gainprm="3 0 0" biastype="affine"', 8.0),
+        ('general gainprm="3 0 0" dyntype="integrator"', 8.0),
+        ('general gainprm="3 0 0" gaintype="affine"', 8.0),
+        ('general gainprm="3 0 0"', 6.0),
+        ('general gainprm="3 0 0" dyntype="none" gaintype="fixed" biastype="none"', 6.0),
+    ],
+)
+def test_servos_become_motors_with_their_limits_of_efforts(tag, limit, tmp_path):
+    """Without a law, gain and control limit the effort of a general actuator, and none is told."""
     text = MJCF.replace('<motor name="n"', f'<{tag} name="n" ctrlrange="-1 1" gear="2"')
     (tmp_path / "robot.xml").write_text(text)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         plant = read_robot(Robot(str(tmp_path / "robot.xml")))[0]
-    assert ["'n'" in str(one.message) for one in told] == [True]
-    assert plant.GetJointActuatorByName("n").effort_limit() == 8.0
+    assert ["'n'" in str(one.message) for one in told] == [True] * (limit == 8.0)
+    assert plant.GetJointActuatorByName("n").effort_limit() == limit
 
 
 @pytest.mark.parametrize("tag", ["motor", "general", "position"])
@@ -403,8 +438,9 @@ def test_no_shape_stops_a_robot(kind: str, shape: str, tag: str, tmp_path: Path)
         "</link>", f"<{tag} name='v'><geometry>{shape}</geometry></{tag}></link>"
     )
     (tmp_path / f"robot{kind}").write_text(text)
-    with pytest.warns(GeometryWarning, match="of 'a'"):
+    with pytest.warns(GeometryWarning, match="of 'a'") as told:
         read_robot(Robot(str(tmp_path / f"robot{kind}")), scene_graph=(scene := SceneGraph()))
+    assert len(told) == 1  # None of what Drake logs of the trial.
     assert scene.model_inspector().num_geometries() == 0
 
 
@@ -425,3 +461,27 @@ def test_no_geom_of_mjcf_stops_a_robot_and_none_with_a_mass_is_lost(geom: str, t
     file.write_text(with_texts(".xml", "</body>", f'<geom {geom} mass="2"/>'))
     with pytest.raises(ModelError, match=r"'d'.* mass"):
         read_robot(Robot(str(file)), scene_graph=SceneGraph())
+
+
+def test_trials_of_shapes_in_two_threads_leave_drakes_log_as_it_was(monkeypatch):
+    """The first ends within the second."""
+    logger, inside, ended = logging.getLogger("drake"), Event(), Event()
+    before = logger.disabled, [*logger.filters]
+
+    class Trial(Parser):
+        def AddModelsFromString(self, text: str, kind: str) -> None:
+            if text == "first":
+                second.start()
+                assert inside.wait(10.0)
+            else:
+                inside.set()
+                assert ended.wait(10.0)
+
+    monkeypatch.setattr(mending, "Parser", Trial)
+    mending._is_read.cache_clear()
+    second = Thread(target=mending._is_read, args=(".urdf", "second"))
+    mending._is_read(".urdf", "first")
+    ended.set()
+    second.join()
+    mending._is_read.cache_clear()
+    assert (logger.disabled, logger.filters) == before

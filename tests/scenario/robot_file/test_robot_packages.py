@@ -9,7 +9,7 @@ from vendors import write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import GeometryWarning, RobotFileWarning, ScenarioError
-from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.reading import needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
 SCENARIO = """
@@ -77,6 +77,27 @@ def test_geometry_of_an_unknown_package_is_left_out_with_the_key(tmp_path: Path)
     with pytest.warns(GeometryWarning, match=r"robot\.packages.*'package://panda_description/"):
         assert drawn(tmp_path, file) == 0
     assert drawn(tmp_path, file, panda_description=str(tmp_path / "workspace/panda")) == 11
+
+
+URDF = """<robot name="a"><link name="b"><visual><geometry>{}</geometry><material name="m">
+<texture filename="package://colours/a.png"/></material></visual></link>
+<gazebo><plugin filename="f"><uri>model://worlds/a</uri></plugin></gazebo></robot>"""
+SDF = """<sdf version="1.9"><model name="a"><link name="b"><visual name="v"><geometry>{}</geometry>
+</visual></link><plugin name="p" filename="f"><uri>model://worlds/a</uri></plugin></model></sdf>"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "shape", "missing"),
+    [
+        ("a.urdf", URDF, '<sphere radius="1"/>', []),
+        ("a.urdf", URDF, '<mesh filename="package://shapes/a.obj"/>', ["shapes"]),
+        ("a.sdf", SDF, "<sphere><radius>1</radius></sphere>", []),
+        ("a.sdf", SDF, "<mesh><uri> package://shapes/a.obj </uri></mesh>", ["shapes"]),
+    ],
+)
+def test_only_packages_of_what_is_read_are_needed(name, text, shape, missing, tmp_path: Path):
+    (tmp_path / name).write_text(text.format(shape))
+    assert needs_of(Robot(str(tmp_path / name))) == (missing, [])
 
 
 @pytest.mark.parametrize(
