@@ -136,7 +136,7 @@ def examine(system: DaeSystem, count: int = COUNT, seed: int = SEED) -> Analysis
         results["constraint_structure"] = constrained
         if system.frictional_contacts:
             margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
-            results["contact_margin"] = margins_of_contacts.over(samples, search=True)
+            results["contact_margin"] = margins_of_contacts.over(samples)
 
     # The outputs.
     without_law = why_no_law(system)

@@ -4,6 +4,7 @@ import argparse
 import shlex
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -160,9 +161,13 @@ def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 
 
 def _new_folder(name: str) -> Path:
-    """A folder below runs/ that no other run has."""
-    folders = (Path("runs", name if i == 1 else f"{name}-{i}") for i in count(1))
-    return next(folder for folder in folders if not folder.exists())
+    """Makes a folder below runs/ that no other run has, also none that begins at this moment."""
+    for i in count(1):
+        folder = Path("runs", name if i == 1 else f"{name}-{i}")
+        with suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            break
+    return folder
 
 
 def plot_command(options: argparse.Namespace) -> int:

@@ -177,11 +177,11 @@ class ContactMargins:
         critical = dict(zip(self._names, (factor * unit).tolist(), strict=True))
         return ContactMargin(float(reserve.item()), critical, state, time)
 
-    def over(self, samples: Samples, search: bool) -> ContactMargin:
+    def over(self, samples: Samples) -> ContactMargin:
         """Returns the smallest margin at samples and, downhill from the worst, between them."""
         p = self._system.parameter_values
         margins = sorted((self.at(state, p) for state in samples.states), key=LOWEST)
-        lower = [self._downhill(samples, m, p) for m in margins[:3]] if search else []
+        lower = [self._downhill(samples, m, p) for m in margins[:3]]
         return min([margins[0], *lower], key=LOWEST)
 
     def along(self, times: FloatArray, states: FloatArray, parameters: FloatArray) -> ContactMargin:

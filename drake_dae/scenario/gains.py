@@ -183,7 +183,7 @@ def _sensed_gains(
         softer = next(filter(settles_along, softened), sensed)
         bare = (
             f". They are those of {softer.stiffness:.2g} N/m, since none are stable with a margin "
-            "at the stated stiffness: sample more often"
+            "at the stated stiffness, where the contact may oscillate: sample more often"
         )
     best = advised_gains(softer, roughness, **errors)
     return best, (
